@@ -36,7 +36,10 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
     gaussians = random_gaussians(600, 0)
     focal = SIZE / 2 / np.tan(np.radians(FOV_DEG) / 2)
     camera = upright(np.array([2.0, -5.0, 6.0]), focal)
-    view = InitialView(tuple(camera.position), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), "town")
+    view = InitialView(
+        tuple(camera.position), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), "town",
+        count_visibility=lambda places: 1 + (places[:, 0] > 0).int() + (places[:, 0] > 0.8).int(),
+    )  # fmt: skip
     write_streamed_page(tmp_path / "scene.json", replace(ExportScene.of(gaussians), page=view), node_size=100)
     expected, nodes = picture(gaussians, camera), len(list(tmp_path.glob("nodes-1/*.bin")))
     assert nodes > 5
@@ -54,6 +57,15 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
         assert page.evaluate("document.title") == "town"
         assert "parts" in page.evaluate("document.getElementById('caption').textContent")
         page.evaluate("document.getElementById('caption').remove()")
+        trust = "document.getElementById('trust')"
+        page.evaluate(f"{trust}.click()")
+        wait_until(lambda: np.abs(page.screenshot() / 255 - near)[40:].max() > 0.3)
+        assert "training cameras" in page.evaluate("document.body.innerText")
+        more_red = (page.screenshot()[40:].astype(int) - (255 * near[40:]).astype(int))[..., 0].mean(axis=0)
+        assert more_red[: SIZE // 3].mean() > more_red[-SIZE // 4 :].mean() + 5  # the west is seen by one camera
+        page.evaluate(f"{trust}.click()")
+        page.evaluate(f"{trust}.parentElement.remove()")
+        wait_until(lambda: psnr(page.screenshot() / 255, expected) > 30)
         cv2.imwrite(str(tmp_path / "shown.png"), page.screenshot()[..., ::-1])
         assert psnr(page.screenshot() / 255, expected) > 30
         for other in (near[::-1], near[:, ::-1]):

@@ -153,6 +153,14 @@ def test_what_lies_far_behind_the_scene_does_not_count():
     assert np.linalg.norm(one.position - other.position) < 0.1 * np.linalg.norm(one.position - one.target)
 
 
+def test_what_fewer_than_three_cameras_see_does_not_widen_the_picture():
+    capture, beyond = nadir(), np.column_stack([np.linspace(290, 310, 90), np.linspace(-20, 20, 90), np.zeros(90)])
+    views = [*(view.camera for view in capture.views), *(camera((x, 0, 50), 0, 0) for x in (295, 305))]
+    look = default_view(capture_of(views, np.concatenate([capture.points, beyond])))
+    assert shown(look, capture.points).mean() > 0.97
+    assert not shown(look, beyond).any()
+
+
 def test_there_is_a_look_without_points_that_two_photographs_show():
     look = default_view(capture_of([camera((0, 0, 50), 0, 0), camera((500, 0, 50), 0, 0)], np.zeros((1, 3))))
     assert np.isfinite(look.position).all()

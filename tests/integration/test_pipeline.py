@@ -160,7 +160,7 @@ def test_a_finished_run_does_nothing_again(capture, copied):
     (copied / "report.html").unlink()  # so that every stage looks
     again = vdgs("run", capture, "--output", copied, *SETTINGS)
     assert again.returncode == 0, again.stderr
-    assert again.stdout.count("nothing to do") == 7
+    assert again.stdout.count("nothing to do") == 8
     assert changed_files(copied, before) <= {"report.html", ".run/progress.json"}
 
 

@@ -1,4 +1,4 @@
-"""`--masks auto`, verb by verb: masks after the coarse stage, used by blocks and shown by the report."""
+"""What moves, verb by verb: masks after the coarse stage, used by blocks and shown by the report."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ import pytest
 from support.captures import tiny_scene, write_colmap
 from support.small_pipeline import BLOCK, SETTINGS, vdgs
 from vdgs.captures.image_cache import load_image
+from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import OrthoRequest, RunRequest
-from vdgs.config.method import MethodConfig
-from vdgs.errors import RunError, VdgsError
+from vdgs.config.method import BlockConfig, MethodConfig
+from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.evaluation.moving_pixels import MIN_MOVING_SHARE, SAMPLED_PHOTOGRAPHS
 from vdgs.ops.api import train
+from vdgs.pipeline import find_motion
 from vdgs.pipeline.run_estimate import Scene, _other_times
 from vdgs.pipeline.time_estimate import MOTION_VIEW_SECONDS, MOTION_VIEW_STEPS
 from vdgs.rendering.ortho.ortho_plan import OrthoPlan
-from vdgs.runs.motion_masks import MOTION_FILE, with_motion_masks
+from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_folder import MOTION_FILE
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_keys import stage_keys
 from vdgs.system.processor_time import Cost
@@ -31,7 +35,7 @@ BOX = np.s_[18:30, 20:44]
 
 
 @pytest.mark.slow
-def test_blocks_leave_out_what_moves(tmp_path, capsys):
+def test_blocks_leave_out_what_moves(tmp_path, capsys, monkeypatch):
     capture, run = tmp_path / "capture", tmp_path / "run"
     write_colmap(capture, tiny_scene())
     painted = capture / "images" / "frame_005.png"
@@ -42,8 +46,23 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys):
     own = np.full(picture.shape[:2], 255, np.uint8)
     own[:6] = 0
     cv2.imwrite(str(capture / "masks" / "frame_005.png"), own)
-    vdgs("train-coarse", capture, "--output", run, "--up", "z", "--masks", "auto", *SETTINGS, "--iterations", "60")
+    vdgs("train-coarse", capture, "--output", run, "--up", "z", *SETTINGS, "--iterations", "60")
+    context, config = RunContext.from_path(run), run / "config.yaml"
+    still = context.run.keys()
+    monkeypatch.setattr(find_motion, "MIN_MOVING_SHARE", 0.1)
+    vdgs("visibility", run)
+    sampled = json.loads((run / MOTION_FILE).read_text())
+    assert not sampled["masked"]
+    assert MIN_MOVING_SHARE < sampled["share"] < 0.03
+    assert with_motion_masks(context.run, context.capture) is context.capture
+    assert context.run.keys() == still
+    assert sorted(file.name for file in (run / MOTION_FILE).parent.iterdir()) == ["key", "motion.json"]
+    vdgs("visibility", run)
+    assert "motion.json: already there" in capsys.readouterr().out.replace("\n", "")
+
+    config.write_text(config.read_text().replace("mask_moving: auto", "mask_moving: 'on'"))
     context = RunContext.from_path(run)
+    assert context.run.keys().blocks != still.blocks
     with pytest.raises(RunError, match="vdgs visibility"):
         with_motion_masks(context.run, context.capture)
     vdgs("visibility", run)
@@ -66,37 +85,47 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys):
     test_view = context.capture.test_views[0]
     assert views[test_view.name].mask_path == test_view.mask_path
 
-    capsys.readouterr()
-    vdgs("visibility", run)
-    assert "motion.json: already there" in capsys.readouterr().out.replace("\n", "")
     vdgs("partition", run, "--blocks", "1")
     vdgs("train-blocks", run, "--block", "0", *BLOCK)
     vdgs("report", run)
     assert "What moves" in (run / "report.html").read_text()
-    config = run / "config.yaml"
-    config.write_text(config.read_text().replace("masks: auto", "masks: masks"))
+    config.write_text(config.read_text().replace("mask_moving: 'on'", "mask_moving: auto"))
+    monkeypatch.setattr(find_motion, "MIN_MOVING_SHARE", MIN_MOVING_SHARE)
+    (run / MOTION_FILE).unlink()
+    vdgs("visibility", run)
+    assert json.loads((run / MOTION_FILE).read_text()) == record
+    assert context.run.keys().blocks == RunContext.from_path(run).run.keys().blocks
+    config.write_text(config.read_text().replace("mask_moving: auto", "mask_moving: 'off'"))
     vdgs("visibility", run)
     assert not (run / MOTION_FILE).parent.exists()
 
 
-def test_masks_of_what_moves_are_of_the_blocks_alone():
+def test_the_setting_counts_by_what_it_does():
     plain = RunSettings.create("/somewhere", CaptureOptions(), MethodConfig())
-    before, after = stage_keys(plain), stage_keys(replace(plain, capture=CaptureOptions(masks="auto")))
-    assert (before.coarse, before.assignment) == (after.coarse, after.assignment)
-    assert before.blocks != after.blocks
+    on = stage_keys(replace(plain, block=BlockConfig(mask_moving="on")))
+    still, found = stage_keys(plain), {"key": stage_keys(plain).visibility, "masked": True}
+    assert still == stage_keys(replace(plain, block=BlockConfig(mask_moving="off")), motion=found)
+    assert still == stage_keys(plain, motion=found | {"masked": False}) == stage_keys(plain, motion=found | {"key": ""})
+    assert on == stage_keys(plain, motion=found)
+    assert (still.coarse, still.assignment) == (on.coarse, on.assignment)
+    assert still.blocks != on.blocks
 
 
 def test_the_time_of_finding_what_moves_is_estimated():
-    step, scene = Cost(2.0, 3.0), Scene(None, [None] * 10, 2, 100)
-    took = {}
-    for masks in ("masks", "auto"):
-        options = CaptureOptions(masks=masks)
-        times = _other_times(scene, step, RunRequest(capture=Path("c"), output=Path("r"), options=options))
-        took[masks] = times["motion"].seconds
-    assert took["masks"] == 0
-    assert took["auto"] == pytest.approx(10 * (2.0 * MOTION_VIEW_STEPS + MOTION_VIEW_SECONDS))
+    step, scene = Cost(2.0, 3.0), Scene(None, [None] * 30, 2, 100)
+    request = RunRequest(capture=Path("c"), output=Path("r"))
+    took = {asked: _other_times(scene, step, request, asked)["motion"].seconds for asked in ("off", "auto", "on")}
+    assert took["off"] == 0
+    assert took["auto"] == pytest.approx(30 * 2.0 * MOTION_VIEW_STEPS + SAMPLED_PHOTOGRAPHS * MOTION_VIEW_SECONDS)
+    assert took["on"] == pytest.approx(30 * (2.0 * MOTION_VIEW_STEPS + MOTION_VIEW_SECONDS))
 
 
 def test_training_in_memory_has_no_place_for_masks(tmp_path):
     with pytest.raises(VdgsError, match="run_dir"):
-        train(tmp_path, capture_options=CaptureOptions(masks="auto"))
+        train(tmp_path, MethodConfig(block=BlockConfig(mask_moving="on")))
+
+
+def test_masks_of_what_moves_are_no_folder(tmp_path):
+    write_colmap(tmp_path, tiny_scene())
+    with pytest.raises(CaptureError, match=r"--block\.mask-moving on"):
+        load_capture(tmp_path, CaptureOptions(masks="auto"))

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -22,6 +26,7 @@ from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
 from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.visibility_store import get_run_visibility
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
 
@@ -116,6 +121,26 @@ def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp
         ours, theirs = (sorted((tmp_path / each.name / views).glob("*.png")) for each in (trained, folder))
         assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
         assert ours
+
+
+def test_films_and_pictures_leave_out_what_few_cameras_see(trained, tmp_path, monkeypatch):
+    frames, path = {}, RenderRequest(run=trained / "run", output=tmp_path, views="orbit", seconds=0.1, device="cpu")
+
+    @contextmanager
+    def film(output: Path, fps: float):
+        yield SimpleNamespace(write=frames.setdefault(output.stem, []).append)
+
+    monkeypatch.setattr("vdgs.rendering.render_run.VideoWriter", film)
+    for number in (0, 4):
+        asked = replace(path, min_visibility=number)
+        render_run(replace(asked, output=tmp_path / f"{number}.mp4"), QUIET)
+        render_run(replace(asked, output=tmp_path / str(number)), QUIET)
+        pictures = [cv2.imread(str(file))[..., ::-1] for file in sorted((tmp_path / str(number)).glob("*.png"))]
+        assert np.array_equal(pictures, frames[str(number)])
+    opened = open_run(trained / "run")
+    seen = get_run_visibility(opened, [view.camera for view in opened.capture.train_views])
+    assert 0 < (seen >= 4).double().mean() < 1
+    assert not np.array_equal(frames["0"], frames["4"])
 
 
 def test_maps_are_drawn_without_the_photographs_too(trained, folder, tmp_path):

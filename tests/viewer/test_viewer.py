@@ -22,6 +22,8 @@ from vdgs.model.exposure import exposure_matrix
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render, without_aliasing
+from vdgs.model.renderer import render, render_scalar_map, without_aliasing
+from vdgs.partition.blocks import save_blocks
 from vdgs.pipeline import build_lod
 from vdgs.viewer import viewer_scene
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
@@ -106,6 +108,26 @@ def test_what_few_cameras_see_can_be_left_out(scene):
     assert np.array_equal(drawn, shown(scene, scene.model("merged").select_anchors(kept), camera))
     assert not np.array_equal(drawn, everything)
     assert np.array_equal(painter.paint(DisplayOptions(), camera, camera), everything)
+
+
+def test_what_few_cameras_see_is_marked(scene):
+    camera, painter, model = scene.capture.views[0].camera, Painter(scene), scene.model("merged")
+    plain, marking = painter.paint(DisplayOptions(), camera, camera), DisplayOptions(mark_trust=True)
+    counted = scene.visibility("merged")
+    for fewer in (8, 0):  # as if as many fewer had flown; at last as it was
+        scene._visibility["merged"] = (counted - fewer).clamp(min=0)
+        marked = painter.paint(marking, camera, camera).astype(int) - plain
+        seen = render_scalar_map(model, scene.visibility("merged"), camera).numpy()
+        assert (fewer == 8) == bool((np.abs(marked).max(axis=-1) > 20).mean() > 0.9)
+        assert fewer == 8 or np.abs(marked[seen > 6]).mean() < 1
+    reddened = painter.scale(marking).colorize(np.arange(4.0)[None])[0].astype(int)
+    assert (reddened[0] == reddened[1]).all()
+    assert (reddened[3] == 255).all()
+    assert len(np.unique(reddened, axis=0)) == 3
+    blocks = replace(marking, layer="blocks")
+    assert np.array_equal(
+        painter.paint(blocks, camera, camera), painter.paint(DisplayOptions("blocks"), camera, camera)
+    )
 
 
 def test_photographs_that_the_model_draws_itself_show_no_error_and_others_do(scene):

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, spread_evenly
-from vdgs.captures.scene_points import scene_points
+from vdgs.captures.scene_points import MIN_SEEN_BY, scene_points
 from vdgs.geometry.similarity import sample_points
 
 #: Vertical angle of view of a first look (choice).
@@ -21,6 +21,8 @@ FOV_DEG = 50.0
 _TRIM_QUANTILE, _FILLED_SHARE = 0.003, 0.8
 #: Points by which the scene is found, points and cameras by which directions are compared.
 _MAX_SCENE_POINTS, _MAX_POINTS, _MAX_CAMERAS = 5000, 300, 60
+#: The picture is framed by the points that so many training cameras see, where these are the half of all.
+_TRUSTED_SEEN_BY = 3
 #: Directions that are compared, in degrees.
 _ELEVATIONS_DEG, _AZIMUTHS_DEG = (5, 12, 20, 30, 40, 50, 60, 70, 80), range(0, 360, 15)
 #: A place this many degrees from the nearest camera is as good as the camera's own. What a direction costs beside the
@@ -39,9 +41,10 @@ class DefaultView(NamedTuple):
 
 
 def default_view(capture: Capture) -> DefaultView:
-    """The whole scene, seen half from above where cameras looked that way, else from the nearest direction in which
-    cameras looked: the direction of the least cost (`_COST_OF_ELEVATION`)."""
-    points = _trimmed(scene_points(capture, _MAX_SCENE_POINTS))
+    """What at least three training cameras see of the scene, seen half from above where cameras looked that way, else
+    from the nearest direction in which cameras looked: the direction of the least cost (`_COST_OF_ELEVATION`)."""
+    known, trusted = (scene_points(capture, _MAX_SCENE_POINTS, each) for each in (MIN_SEEN_BY, _TRUSTED_SEEN_BY))
+    points = _trimmed(trusted if 2 * len(trusted) >= len(known) else known)
     if len(points) < 10:
         points = capture.points if len(capture.points) else np.zeros((1, 3))
     support = _Support(capture, sample_points(points, _MAX_POINTS))

@@ -98,8 +98,8 @@ def _check_options(root: Path, options: CaptureOptions) -> None:
     found = find_range_errors(options)
     if found:
         raise CaptureError("\n  ".join(found))
-    if not (root / options.mask_folder).is_dir() and not Path(options.mask_folder).is_dir():
-        check_folder("--masks", options.mask_folder)
+    if not (root / options.masks).is_dir() and not Path(options.masks).is_dir():
+        check_folder("--masks", options.masks)
 
 
 # -------------------------------------------------------------------------------------------- points

@@ -22,13 +22,14 @@ def find_masks(
     Raises `CaptureError` for a folder of masks that was asked for and is not there, and where masks are there but none
     of them is of a photograph.
     """
-    names = MASK_FOLDERS if options.mask_folder == CaptureOptions.masks else ()
-    folder = next((root / name for name in names if (root / name).is_dir()), root / options.mask_folder)
-    asked_for = options.mask_folder != CaptureOptions.masks
-    if asked_for and not folder.is_dir() and Path(options.mask_folder).is_dir():
-        folder = Path(options.mask_folder)  # given from where the person stands
+    asked_for = options.masks != CaptureOptions.masks
+    names = () if asked_for else MASK_FOLDERS
+    folder = next((root / name for name in names if (root / name).is_dir()), root / options.masks)
+    if asked_for and not folder.is_dir() and Path(options.masks).is_dir():
+        folder = Path(options.masks)  # given from where the person stands
     if asked_for and not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder, though --masks asks for it.")
+        moving = " Masks of what moves are made with --block.mask-moving on." if options.masks == "auto" else ""
+        raise CaptureError(f"{folder}: no such folder, though --masks asks for it.{moving}")
     masks = dict[str, Path | None]()
     for view in views:
         photograph = view.image_path or find_file(root / images, view.name)

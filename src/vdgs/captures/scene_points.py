@@ -18,13 +18,15 @@ MIN_SEEN_BY, MAX_DISTANCE_RATIO = 2, 4.0
 _MAX_GSD_CAMERAS = 60
 
 
-def scene_points(capture: Capture, max_points: int | None = None) -> Float[np.ndarray, "n 3"]:
-    """The sparse points [n, 3] that at least two training photographs show, without the background; of `max_points`
-    of them if given."""
+def scene_points(
+    capture: Capture, max_points: int | None = None, min_seen_by: int = MIN_SEEN_BY
+) -> Float[np.ndarray, "n 3"]:
+    """The sparse points [n, 3] that at least so many training cameras see, without the background; of `max_points` of
+    them if given."""
     cameras = [view.camera for view in capture.train_views]
     points = capture.points if max_points is None else sample_points(capture.points, max_points)
     seen = count_visibility(torch.from_numpy(points), cameras).numpy()
-    shown = points[seen >= min(MIN_SEEN_BY, len(cameras))]
+    shown = points[seen >= min(min_seen_by, len(cameras))]
     if not len(shown):
         return shown
     distance = cKDTree([camera.position for camera in cameras]).query(shown, workers=1)[0]

@@ -24,7 +24,7 @@ from vdgs.config.ranges import WORKER_COUNT, FlagName, Range
 class VisibilityArguments(StageArguments):
     """Count how many training cameras see each part of a run's scene; writes a map and the distribution.
 
-    Of a run with --masks auto it first makes the masks of what moves.
+    Before, what moves between the photographs is looked for, and masked for the blocks (--block.mask-moving).
     """
 
 

@@ -17,10 +17,6 @@ CaptureFormat = Literal[
 ]  # fmt: skip
 
 
-#: The value of `--masks` that also masks what moves between the photographs.
-AUTO_MASKS = "auto"
-
-
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
     """How to read a folder of photographs with cameras."""
@@ -71,11 +67,4 @@ class CaptureOptions:
     undistorted_folder: Annotated[Path | None, Output()] = None
     """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
     masks: str = "masks"
-    """Folder of masks (white = keep), named like the photographs. That is name.png or name.jpg.png. auto: those in
-    masks, if any, and for the blocks and the detail of maps also masks of what moves, found by the coarse model after
-    its training."""
-
-    @property
-    def mask_folder(self) -> str:
-        """The folder of the capture's own masks."""
-        return CaptureOptions.masks if self.masks == AUTO_MASKS else self.masks
+    """Folder of masks (white = keep), named like the photographs. That is name.png or name.jpg.png."""

@@ -309,6 +309,10 @@ class BlockConfig:
     """Draw the anchors outside the block too, frozen (choice). Off: what the block's cameras see there is empty."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
+    mask_moving: Literal["auto", "on", "off"] = "auto"
+    """Leave out what moves between the photographs. It is found by the coarse model after its training, and left out of
+    the blocks and of the detail of maps. auto: where a sample of the photographs shows enough that moves
+    (docs/sfm.md)."""
     max_anchors_total: Annotated[int, Range(0, MAX_COUNT)] = 0
     """The same for all blocks together; 0 for no limit. Each block has a share in proportion
     to the coarse anchors it owns. No anchor is removed: a block that starts with more grows none."""

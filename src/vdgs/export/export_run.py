@@ -11,9 +11,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Int
 from rich.console import Console
 from rich.markup import escape
+from torch import Tensor
 
 from vdgs.captures.first_view import default_view
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
@@ -52,6 +54,7 @@ from vdgs.system.console import make_progress_bar
 from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
 from vdgs.system.scratch import remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
+from vdgs.visibility.visibility_counts import count_visibility
 
 #: What was written and lost, beside the run's other results.
 RECORD_FILE = "export.json"
@@ -96,14 +99,25 @@ def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
     position, target = default_view(run.capture)
     red, green, blue = (float(each) for each in run.model.background)
     title = run.capture.root.resolve().name or "scene"
-    return InitialView(_point(position), _point(target), (red, green, blue), title, most_bytes)
+    cameras = [view.camera for view in run.capture.train_views]
+    return InitialView(
+        _point(position), _point(target), (red, green, blue), title, most_bytes,
+        lambda places: count_visibility(places, cameras),
+    )  # fmt: skip
 
 
 def _view_in_frame(page: InitialView, frame: LocalFrame) -> InitialView:
     """A page in local coordinates."""
-    ground = np.array([page.position, page.target])
+    ground, count = np.array([page.position, page.target]), page.count_visibility
     position, target = frame.apply(ground)
-    return replace(page, position=_point(position), target=_point(target))
+
+    def count_local(places: Tensor) -> Tensor:
+        assert count is not None
+        return count(torch.from_numpy(frame.apply_inverse(places.double().numpy())))
+
+    return replace(
+        page, position=_point(position), target=_point(target), count_visibility=count_local if count else None
+    )
 
 
 def _point(place: np.ndarray) -> tuple[float, float, float]:

@@ -20,7 +20,6 @@ from rich.console import Console
 from torch import Tensor
 
 from vdgs.captures.capture import Capture as Capture
-from vdgs.config.capture_options import AUTO_MASKS
 from vdgs.config.capture_options import CaptureOptions as CaptureOptions
 from vdgs.config.commands import ExportRequest, ModelName, ViewRequest
 from vdgs.config.method import AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
@@ -349,10 +348,11 @@ def train(
 ) -> Scene:
     """Train a scene as `vdgs run` does: global model, V, blocks, cameras, block training, merge; the same bits.
 
-    A `TrainConfig` trains the global model alone. Without `run_dir` all is done in this process and in memory, and
-    after every step each callback is given a `TrainingEvent` (stage, iteration, iterations, loss, psnr in dB, anchors);
-    one that returns True ends the stage early. With `run_dir` it is a run folder, which the same call continues after a
-    crash; its blocks train in processes of their own, so it takes the capture's folder and no callbacks.
+    A `TrainConfig` trains the global model alone. Without `run_dir` all is done in this process and in memory, what
+    moves between photographs is not looked for, and after every step each callback is given a `TrainingEvent` (stage,
+    iteration, iterations, loss, psnr in dB, anchors); one that returns True ends the stage early. With `run_dir` it is
+    a run folder, which the same call continues after a crash; its blocks train in processes of their own, so it takes
+    the capture's folder and no callbacks.
     `capture_options` say how a folder is read. Raises CaptureError for a capture that cannot become a scene, VdgsError
     for settings, TrainingDiverged.
     """
@@ -361,8 +361,8 @@ def train(
     config = preset(config) if isinstance(config, str) else config
     device, options = select_device(device).device, vars(capture_options or CaptureOptions())
     if run_dir is None:
-        if options["masks"] == AUTO_MASKS:
-            raise VdgsError("masks='auto' keeps the masks that it makes in a run folder: name one (run_dir)")
+        if isinstance(config, MethodConfig) and config.block.mask_moving == "on":
+            raise VdgsError("mask_moving='on' keeps the masks that it makes in a run folder: name one (run_dir)")
         opened = capture if isinstance(capture, Capture) else load_capture(capture, **options)
         return Scene(train_in_memory(opened, config, tuple(callbacks), _warning_console(), device), opened)
     if callbacks or isinstance(capture, Capture):

@@ -1,26 +1,41 @@
-"""`--masks auto`: what moves between the training photographs, found by the coarse model, as masks for the blocks."""
+"""What moves between the training photographs, found by the coarse model, as masks for the blocks
+(`--block.mask-moving`)."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool
 from rich.console import Console
 
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.capture import View
+from vdgs.captures.capture import View, spread_evenly
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_files import decode_mask
 from vdgs.evaluation.comparison_images import write_png
-from vdgs.evaluation.moving_pixels import MAX_SHARE, Residual, make_residual, moving_pixels, overlapping_views
+from vdgs.evaluation.moving_pixels import (
+    MASK_MARGIN_PX,
+    MAX_SHARE,
+    MIN_MOVING_SHARE,
+    SAMPLED_PHOTOGRAPHS,
+    Residual,
+    grow,
+    make_residual,
+    moving_pixels,
+    overlapping_views,
+)
 from vdgs.model.exposure import apply_exposure
 from vdgs.model.renderer import render
-from vdgs.runs.motion_masks import MOTION_EXAMPLES, MOTION_FILE, has_motion_masks, motion_folder, wants_motion_masks
+from vdgs.runs.motion_masks import has_motion_record
 from vdgs.runs.open_run import OpenedRun, check_has_anchors
 from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_folder import MOTION_EXAMPLES
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import write_array, write_bytes, write_json
 from vdgs.system.console import show_share
 from vdgs.system.documents import JsonObject
@@ -30,46 +45,54 @@ EXAMPLES, EXAMPLE_WIDTH_PX = 6, 480
 
 
 def find_run_motion(context: RunContext, console: Console, device: str = "cpu") -> None:
-    """Write the masks of what moves (`runs.motion_masks`), or continue; nothing where they are there. Where the run
-    does not want them any more they are deleted.
+    """Write the record and the masks of what moves (`runs.motion_masks`), or continue; nothing where they are there.
+    Where the run leaves nothing out any more they are deleted.
 
     RunError without a coarse model, CaptureError for a photograph that cannot be decoded, Stopped after Ctrl-C.
     """
-    run = context.run
-    if not wants_motion_masks(run):
-        shutil.rmtree(motion_folder(run).path, ignore_errors=True)
+    run, asked = context.run, context.run.settings().block.mask_moving
+    if asked == "off":
+        shutil.rmtree(run.motion_file.parent, ignore_errors=True)
         return
-    if has_motion_masks(run):
-        console.print(f"{run.path / MOTION_FILE}: already there; nothing to do", highlight=False)
+    if has_motion_record(run):
+        console.print(f"{run.motion_file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
-        opened, folder, key = context.open_model("coarse", device), motion_folder(run), run.keys().visibility
+        opened, key = context.open_model("coarse", device), run.keys().visibility
         check_has_anchors(run, len(opened.model.anchors))
-        folder.reset_unless(key)
-        views = opened.capture.train_views
-        step = run.begin_step("coarse", "looking for what moves", "photographs", 2 * len(views))
-        records = list[JsonObject]()
-        with show_share(console, "looking for what moves") as show:
-            for index, view in enumerate(views):
-                _keep_residual(opened, index, view, _residual_file(folder.path, index))
-                show(index + 1, 2 * len(views))
-                step(index + 1)
-            for index, view in enumerate(views):
-                records.append(_mask_view(opened, index, view, folder.path))
-                show(len(views) + index + 1, 2 * len(views))
-                step(len(views) + index + 1)
-        _write_examples(run.path / MOTION_EXAMPLES, views, records, folder.path)
-        shares = [record["share"] for record in records if record["mask"] is not None]
-        share = sum(shares) / len(views)
-        write_json(run.path / MOTION_FILE, {"key": key, "share": share, "photographs": records})
-        shutil.rmtree(folder.path / "residuals")
-    masked, too_much = len(shares), [record["photograph"] for record in records if record["share"] > MAX_SHARE]
+        StageFolder(run.motion_file.parent).reset_unless(key)
+        search = _MotionSearch(opened, run.motion_file.parent, context, console)
+        sample = spread_evenly(opened.capture.train_views, SAMPLED_PHOTOGRAPHS) if asked == "auto" else ()
+        share = search.share_of(sample) if sample else 1.0
+        record: JsonObject = {"key": key, "masked": share >= MIN_MOVING_SHARE, "share": share, "photographs": []}
+        if record["masked"]:
+            record |= {"share": search.share_of(opened.capture.train_views), "photographs": search.records()}
+            _write_examples(run.path / MOTION_EXAMPLES, opened.capture.train_views, search.records(), search.folder)
+        else:
+            record["sampled"] = len(sample)
+            search.remove_masks()
+        write_json(run.motion_file, record)
+        shutil.rmtree(search.folder / "residuals", ignore_errors=True)
+    _tell(record, run.path / MOTION_EXAMPLES, console)
+
+
+def _tell(record: JsonObject, examples: Path, console: Console) -> None:
+    """Say what was found."""
+    share, photographs = record["share"], record["photographs"]
+    if not record["masked"]:
+        console.print(
+            f"what moves: {share:.2%} of {record['sampled']} photographs, too little to leave out "
+            f"(from {MIN_MOVING_SHARE:.1%}; --block.mask-moving)",
+            highlight=False,
+        )
+        return
+    masked = sum(each["mask"] is not None for each in photographs)
     console.print(
-        f"masks auto: {share:.1%} of the training photographs moves, in {masked} of {len(views)}; the blocks leave it "
-        f"out ({run.path / MOTION_EXAMPLES})" if masked else "masks auto: nothing moves in the training photographs",
+        f"what moves: {share:.1%} of the training photographs, in {masked} of {len(photographs)}; the blocks leave it "
+        f"out ({examples}; --block.mask-moving)" if masked else "what moves: nothing in the training photographs",
         highlight=False,
     )  # fmt: skip
-    if too_much:
+    if too_much := [each["photograph"] for each in photographs if each["share"] > MAX_SHARE]:
         console.print(
             f"[yellow]note[/] {len(too_much)} photographs differ from the others in more than {MAX_SHARE:.0%} of their "
             f"pixels and are not masked, such as {too_much[0]}",
@@ -77,12 +100,47 @@ def find_run_motion(context: RunContext, console: Console, device: str = "cpu") 
         )
 
 
-def _residual_file(folder: Path, index: int) -> Path:
-    return folder / "residuals" / f"{index:05d}.npy"
+class _MotionSearch:
+    """Looks for what moves in some of the training photographs, each once."""
+
+    def __init__(self, opened: OpenedRun, folder: Path, context: RunContext, console: Console) -> None:
+        self._opened, self.folder, self._context, self._console = opened, folder, context, console
+        self._found, self._unit = dict[int, JsonObject](), camera_height(opened.capture)
+
+    def share_of(self, views: Sequence[View]) -> float:
+        """The mean share of the photographs' pixels that moves; writes their masks."""
+        known, cameras = self._opened.capture.train_views, [view.camera for view in self._opened.capture.train_views]
+        names = {view.name for view in views}
+        chosen = [index for index, view in enumerate(known) if view.name in names]
+        step = self._context.run.begin_step("coarse", "looking for what moves", "photographs", len(chosen))
+        with show_share(self._console, "looking for what moves") as show:
+            for number, index in enumerate(chosen, start=1):
+                if index not in self._found:
+                    own = self._residual(index)
+                    others = [self._residual(other) for other in overlapping_views(index, cameras, own.depth)]
+                    self._found[index] = _mask_view(self._opened, index, moving_pixels(own, others), self.folder)
+                show(number, len(chosen))
+                step(number)
+        masked = [self._found[index]["share"] for index in chosen if self._found[index]["mask"] is not None]
+        return float(sum(masked)) / len(chosen)
+
+    def records(self) -> list[JsonObject]:
+        """What was found in each training photograph."""
+        return [self._found[index] for index in sorted(self._found)]
+
+    def remove_masks(self) -> None:
+        for record in self.records():
+            if record["mask"] is not None:
+                (self.folder / record["mask"]).unlink(missing_ok=True)
+
+    def _residual(self, index: int) -> Residual:
+        view, file = self._opened.capture.train_views[index], self.folder / "residuals" / f"{index:05d}.npy"
+        _keep_residual(self._opened, index, view, self._unit, file)
+        return _read_residual(view, self._unit, file)
 
 
-def _keep_residual(opened: OpenedRun, index: int, view: View, file: Path) -> None:
-    """Compare a training photograph with its render, unless that was done before."""
+def _keep_residual(opened: OpenedRun, index: int, view: View, unit: float, file: Path) -> None:
+    """Compare a training photograph with its render, unless that was done before; depths are in units of `unit`."""
     if file.exists():
         return
     with torch.no_grad():
@@ -96,29 +154,25 @@ def _keep_residual(opened: OpenedRun, index: int, view: View, file: Path) -> Non
     picture = load_image(view)
     mask = None if picture.mask is None else picture.mask.numpy()
     found = make_residual(view.camera, picture.image.numpy(), mask, shown.cpu().numpy(), depth.cpu().numpy())
-    scaled = found.depth / camera_height(opened.capture)  # in any unit within the range of 16 bits
+    scaled = found.depth / unit  # within the range of 16 bits
     write_array(file, np.concatenate([found.difference, scaled[..., None]], axis=-1).astype(np.float16))
 
 
-def _read_residual(opened: OpenedRun, index: int, folder: Path) -> Residual:
-    values = np.load(_residual_file(folder, index), allow_pickle=False).astype(np.float32)
+def _read_residual(view: View, unit: float, file: Path) -> Residual:
+    values = np.load(file, allow_pickle=False).astype(np.float32)
     height, width = values.shape[:2]
-    camera = opened.capture.train_views[index].camera.resized(width, height)
-    depth = values[..., 3] * camera_height(opened.capture)
-    return Residual(camera, np.ascontiguousarray(values[..., :3]), np.ascontiguousarray(depth))
+    depth = np.ascontiguousarray(values[..., 3] * unit)
+    return Residual(view.camera.resized(width, height), np.ascontiguousarray(values[..., :3]), depth)
 
 
-def _mask_view(opened: OpenedRun, index: int, view: View, folder: Path) -> JsonObject:
-    """Find what moves in a view, write its mask where something does, and return its record."""
-    cameras = [each.camera for each in opened.capture.train_views]
-    own = _read_residual(opened, index, folder)
-    others = [_read_residual(opened, other, folder) for other in overlapping_views(index, cameras, own.depth)]
-    moves = moving_pixels(own, others)
+def _mask_view(opened: OpenedRun, index: int, moves: Bool[np.ndarray, "h w"], folder: Path) -> JsonObject:
+    """Write the mask of a view where something moves, and return its record."""
+    view = opened.capture.train_views[index]
     record: JsonObject = {"photograph": view.name, "share": float(moves.mean()), "mask": None}
     if not 0 < record["share"] <= MAX_SHARE:
         return record
     size, own_mask = (view.camera.width, view.camera.height), load_image(view).mask
-    keep = cv2.resize(moves.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0
+    keep = cv2.resize(grow(moves, MASK_MARGIN_PX).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0
     if own_mask is not None:
         keep &= own_mask.numpy() > 0
     record["mask"] = f"{index:05d}.png"

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
-from vdgs.config.capture_options import AUTO_MASKS
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, TrainConfig, block_train_config
 from vdgs.distributed.resource_allocation import (
@@ -21,6 +20,7 @@ from vdgs.distributed.resource_allocation import (
     allocate_local,
     exceeds_memory,
 )
+from vdgs.evaluation.moving_pixels import MAX_OTHERS, SAMPLED_PHOTOGRAPHS
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_num_threads
 from vdgs.kernels.device_selection import cards_of
@@ -202,7 +202,7 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
         "stereo": Cost(stereo / get_num_threads(), stereo),
         "coarse": steps.stage(config, drawn, start, coarse_growth),
         "blocks": _side_by_side((block_steps + START) * blocks, local),
-        **_other_times(scene, steps.step(drawn, grown), request),
+        **_other_times(scene, steps.step(drawn, grown), request, method.block.mask_moving),
     }
     return RunEstimate(
         anchors=sparse.anchors,
@@ -243,14 +243,15 @@ def _side_by_side(cost: Cost, allocation: Allocation) -> Cost:
     return Cost(cost.processor_seconds / get_num_threads(), cost.processor_seconds)
 
 
-def _other_times(scene: Scene, step: Cost, request: RunRequest) -> dict[str, Cost]:
-    """What is drawn and measured, by what steps take, and the rest."""
+def _other_times(scene: Scene, step: Cost, request: RunRequest, mask_moving: str) -> dict[str, Cost]:
+    """What is drawn and measured, by what steps take, and the rest. Where `mask_moving` is `auto` masks may come on
+    top of the sample that is compared."""
     views = len(scene.cameras) + scene.test_views
     maps = MAP_STEPS * views / scene.views_per_point if request.ortho and has_ortho_dependencies() else 0.0
-    masked = len(scene.cameras) if request.options.masks == AUTO_MASKS else 0
-    comparing = MOTION_VIEW_SECONDS * masked
+    compared = {"on": len(scene.cameras), "auto": min(SAMPLED_PHOTOGRAPHS, len(scene.cameras)), "off": 0}[mask_moving]
+    drawn, comparing = min(len(scene.cameras), (MAX_OTHERS + 1) * compared), MOTION_VIEW_SECONDS * compared
     return {
-        "motion": step * (MOTION_VIEW_STEPS * masked) + Cost(comparing, comparing),
+        "motion": step * (MOTION_VIEW_STEPS * drawn) + Cost(comparing, comparing),
         "measuring": step * (scene.test_views * (COARSE_VIEW_STEPS + MERGED_VIEW_STEPS)),
         "maps": step * maps,
         "other": Cost(OTHER_SECONDS, OTHER_SECONDS),

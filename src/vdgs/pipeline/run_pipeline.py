@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.output_guard import check_output
-from vdgs.config.capture_options import AUTO_MASKS, CaptureOptions
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import LodRequest, OrthoRequest, RunRequest
 from vdgs.config.ranges import check_ranges
 from vdgs.config.validation_rules import check_config
@@ -105,8 +105,7 @@ def _find_points(run_request: RunRequest, console: Console) -> RunRequest:
     _title(console, "points")
     request = make_posed_request(run_request)
     make_posed_capture(request, posed.options, console, RunFolder(run_request.output))
-    masks = AUTO_MASKS if run_request.options.masks == AUTO_MASKS else CaptureOptions.masks
-    options = replace(run_request.options, images=size, format="auto", masks=masks, undistort=False)
+    options = replace(run_request.options, images=size, format="auto", masks=CaptureOptions.masks, undistort=False)
     return replace(run_request, capture=request.output, options=options)
 
 

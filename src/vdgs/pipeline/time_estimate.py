@@ -39,9 +39,9 @@ TEXTURE_RANGE = (8.0, 36.0)
 #: Steps are timed with at most so many times as many anchors as sparse points make; how far those that are added lie
 #: from them, in voxels.
 MAX_CROWDING, CROWD_SPREAD = 20.0, 3.0
-#: Of `--masks auto`: drawing a training photograph and its depth, in steps, and comparing it with ten others (measured:
-#: 0.02 to 0.05 s and 0.4 to 0.8 s at 320 to 407 pixels of width), in processor seconds.
-MOTION_VIEW_STEPS, MOTION_VIEW_SECONDS = 0.7, 0.6
+#: Of finding what moves: drawing a training photograph and its depth, in steps, and comparing it with twenty others
+#: (measured: 0.02 to 0.05 s and 0.1 to 0.4 s at 320 to 407 pixels of width), in processor seconds.
+MOTION_VIEW_STEPS, MOTION_VIEW_SECONDS = 0.7, 0.3
 #: Share of a photograph's stereo that confirming its depths adds to finding them.
 CONFIRMING = 0.15
 #: What measuring a view takes, in training steps of its size: of the coarse model, and of the merged one with its

@@ -17,7 +17,7 @@ from vdgs.captures.reconstruction import (
 from vdgs.report.html_page import Html, details, figure, heading, join_html, link, paragraph, section, table
 from vdgs.report.place_section import MAP_FILE, current_map
 from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles, format_percent
-from vdgs.runs.motion_masks import MOTION_EXAMPLES, MOTION_FILE
+from vdgs.runs.run_folder import MOTION_EXAMPLES, MOTION_FILE
 from vdgs.system.records import record_from_dict
 from vdgs.system.units import ABSENT, count, format_length
 
@@ -93,12 +93,12 @@ def visibility_section(report: ReportedRun) -> Html:
 
 
 def motion_section(report: ReportedRun) -> Html:
-    """What `--masks auto` found to move; nothing of a run without it."""
+    """What was found to move; nothing of a run whose blocks leave nothing out."""
     source = report.files()
     record = source.record(MOTION_FILE)
-    if not record:
+    rows = record.rows("photographs") if record else []
+    if not rows:
         return Html("")
-    rows = record.rows("photographs")
     masked = sum(row.text("mask") is not None for row in rows)
     text = (
         f"{format_percent(record.number('share'))} of the training photographs moves, in {masked} of {len(rows)}: it "

@@ -102,7 +102,7 @@ def _resume(
 def capture_options_changed(run: RunFolder, settings: RunSettings) -> bool:
     """Whether the run reads its capture with other options: a difference of captures is due to these then."""
     before, now = (each.capture for each in (run.settings(), settings))
-    return replace(before, masks=before.mask_folder) != replace(now, masks=now.mask_folder)
+    return before != now
 
 
 def _copy_reconstruction(root: Path, run: Path) -> None:

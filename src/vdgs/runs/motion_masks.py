@@ -1,8 +1,8 @@
-"""Masks of what moves, which a run makes after its coarse stage (`--masks auto`). Its blocks train with them, and maps
-take detail by them; test views are measured whole.
+"""Masks of what moves, which a run makes after its coarse stage (`--block.mask-moving`). Its blocks train with them,
+and maps take detail by them; test views are measured whole.
 
-RUN/coarse/motion/  key, motion.json (share and mask of each training photograph), NNNNN.png (white = keep, the
-                    capture's own mask included), examples.png
+RUN/coarse/motion/  key, motion.json (share and mask of each training photograph, or how little moves in a sample),
+                    NNNNN.png (white = keep, the capture's own mask included), examples.png
 """
 
 from __future__ import annotations
@@ -10,49 +10,42 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vdgs.captures.capture import Capture
-from vdgs.config.capture_options import AUTO_MASKS
 from vdgs.errors import RunError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.system.atomic_files import read_json, read_json_or_empty
+from vdgs.runs.stage_keys import leaves_out_motion
+from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.quoting import shell_word
 
-#: The record of the masks, relative to the run, and pictures of some of them.
-MOTION_FILE, MOTION_EXAMPLES = "coarse/motion/motion.json", "coarse/motion/examples.png"
 
-
-def motion_folder(run: RunFolder) -> StageFolder:
-    """Where the masks of a run lie."""
-    return StageFolder((run.path / MOTION_FILE).parent)
-
-
-def wants_motion_masks(run: RunFolder) -> bool:
-    """Whether the blocks of a run train with masks of what moves."""
-    return run.settings().capture.masks == AUTO_MASKS
-
-
-def has_motion_masks(run: RunFolder) -> bool:
-    """Whether they are complete for the coarse model that is there."""
-    record, folder = read_json_or_empty(run.path / MOTION_FILE), motion_folder(run).path
+def has_motion_record(run: RunFolder) -> bool:
+    """Whether what moves was looked for with the coarse model that is there, and the masks are complete."""
+    record = read_json_or_empty(run.motion_file)
+    if record.get("key") != run.keys().visibility:
+        return False
     masks = [each["mask"] for each in record.get("photographs", ()) if each["mask"] is not None]
-    return record.get("key") == run.keys().visibility and all((folder / mask).exists() for mask in masks)
+    is_enough = bool(record.get("masked")) or run.settings().block.mask_moving == "auto"
+    return is_enough and all(run.motion_file.with_name(mask).exists() for mask in masks)
 
 
 def with_motion_masks(run: RunFolder, capture: Capture, *, needed: bool = True) -> Capture:
-    """The capture with the masks of what moves in place of its own, which they include; as it is where the run wants
-    none. Where they are not made yet RunError, unless they are not `needed`: then the capture as it is."""
-    if not wants_motion_masks(run):
+    """The capture with the masks of what moves in place of its own, which they include; as it is where the run leaves
+    nothing out. Where `on` asks for masks that are not made yet RunError, unless they are not `needed`: then the
+    capture as it is."""
+    record, settings = read_json_or_empty(run.motion_file), run.settings()
+    if not leaves_out_motion(settings, run.keys().visibility, record):
         return capture
-    if not has_motion_masks(run):
+    if not has_motion_record(run):
         if not needed:
             return capture
         raise RunError(
-            f"{run.path / MOTION_FILE}: --masks auto needs the masks of what moves, which are not made for this coarse "
-            f"model. Make them: vdgs visibility {shell_word(run.path)}"
+            f"{run.motion_file}: the blocks need the masks of what moves, which are not made for this coarse model. "
+            f"Make them: vdgs visibility {shell_word(run.path)}"
         )
-    folder = motion_folder(run).path
-    found = {each["photograph"]: each["mask"] for each in read_json(run.path / MOTION_FILE)["photographs"]}
-    masks = {name: folder / mask for name, mask in found.items() if mask is not None}
+    masks = {
+        each["photograph"]: run.motion_file.with_name(each["mask"])
+        for each in record["photographs"]
+        if each["mask"] is not None
+    }
     views = [
         replace(view, mask_path=masks[view.name]) if view.split == "train" and view.name in masks else view
         for view in capture.views

@@ -16,11 +16,15 @@ from vdgs.runs.config_file import ConfigFile, changed_flags
 from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.stage_keys import StageKeys, stage_keys
-from vdgs.system.atomic_files import read_json
+from vdgs.system.atomic_files import read_json, read_json_or_empty
 from vdgs.system.file_locks import is_known_locked, lock_folder
 from vdgs.system.quoting import shell_line, shell_word
 from vdgs.system.records import record_from_dict
 from vdgs.system.step_progress import StepProgress, StepRecord
+
+#: The record of what moves between the photographs, and a picture of the photographs of which most moves
+#: (`runs.motion_masks`), relative to the run.
+MOTION_FILE, MOTION_EXAMPLES = "coarse/motion/motion.json", "coarse/motion/examples.png"
 
 #: The page about a run (`vdgs report`) and the facts of its place, in its folder.
 REPORT_FILE, PLACE_FILE = "report.html", "place.json"
@@ -141,7 +145,7 @@ class RunFolder:
         if old == settings:
             return []
         changed = changed_flags(old, settings)
-        after = stage_keys(settings, self.coarse_model_id())
+        after = self.keys(settings)
         lost = []
         if self.coarse.has_output() and self.coarse.key() != after.coarse:
             lost.append("the coarse model")
@@ -190,9 +194,15 @@ class RunFolder:
         """The settings of the run but for the capture."""
         return self.settings().method
 
-    def keys(self) -> StageKeys:
-        """The key of every stage, for the settings that config.yaml holds and the coarse model that is there."""
-        return stage_keys(self.settings(), self.coarse_model_id())
+    def keys(self, settings: RunSettings | None = None) -> StageKeys:
+        """The key of every stage, for these settings or those that config.yaml holds, and for the coarse model and the
+        record of what moves that are there."""
+        return stage_keys(settings or self.settings(), self.coarse_model_id(), read_json_or_empty(self.motion_file))
+
+    @property
+    def motion_file(self) -> Path:
+        """The record of what moves between the photographs (`runs.motion_masks`)."""
+        return self.path / MOTION_FILE
 
     def coarse_model_id(self) -> str | None:
         """The identity of the coarse model; None while there is none."""

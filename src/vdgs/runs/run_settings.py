@@ -20,8 +20,8 @@ SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
 def with_absolute_paths(options: CaptureOptions, capture: Path) -> CaptureOptions:
     """As config.yaml holds them: stages hand the capture on, also to other machines."""
     paths: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
-    asked = {"images": options.images, "masks": options.mask_folder}
-    for name, folder in asked.items() if options.mask_folder != CaptureOptions.masks else [("images", options.images)]:
+    asked = {"images": options.images, "masks": options.masks}
+    for name, folder in asked.items() if options.masks != CaptureOptions.masks else [("images", options.images)]:
         if folder and not (capture_root(capture) / folder).is_dir() and Path(folder).is_dir():  # outside the capture
             paths[name] = Path(folder).resolve().as_posix()
     return replace(options, **paths)

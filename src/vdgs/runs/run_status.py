@@ -19,7 +19,7 @@ from vdgs.runs.model_integrity import integrity_error, path_to_delete
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
-from vdgs.runs.stage_keys import StageKeys, stage_keys
+from vdgs.runs.stage_keys import StageKeys
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.file_locks import is_known_locked
 from vdgs.system.quoting import shell_word
@@ -136,7 +136,7 @@ def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunSt
     keys, why, problem = None, "", ""
     try:
         settings = run.settings() if settings is None else settings
-        keys = stage_keys(settings, run.coarse_model_id())
+        keys = run.keys(settings)
     except VdgsError as error:
         why = _first_line(str(error))
         problem = why if settings else f"correct {run.config_file}, or put back the one that was there: {why}"

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vdgs.config.capture_options import AUTO_MASKS, CaptureOptions
 from vdgs.runs.run_settings import RunSettings
 
 #: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
@@ -39,23 +39,31 @@ class StageKeys:
     merge: str
 
 
-def stage_keys(settings: RunSettings, coarse_model: str | None = None) -> StageKeys:
+def stage_keys(
+    settings: RunSettings, coarse_model: str | None = None, motion: Mapping[str, Any] | None = None
+) -> StageKeys:
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
-    (`coarse_model`): trained again on another machine it may differ in its last bits."""
+    (`coarse_model`): trained again on another machine it may differ in its last bits. `motion` is the record of what
+    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not."""
     keys, plain = dict[str, str](), settings.to_dict()
     for stage, (sections, before) in STAGE_DEPENDENCIES.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
         own: dict[str, Any] = {name: hashable_settings(name, plain[name]) for name in sections}
-        if stage == "blocks" and settings.capture.masks == AUTO_MASKS:  # what moves is left out of the blocks alone
-            own["masks"] = AUTO_MASKS
+        if stage == "blocks":  # what is asked counts by what it does
+            del own["block"]["mask_moving"]
+            own |= {"masks": "auto"} if leaves_out_motion(settings, keys["visibility"], motion or {}) else {}
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)
 
 
+def leaves_out_motion(settings: RunSettings, visibility_key: str, motion: Mapping[str, Any]) -> bool:
+    """Whether the blocks are trained with masks of what moves: with `auto`, where the record finds enough."""
+    asked = settings.block.mask_moving
+    return asked == "on" or (asked == "auto" and motion.get("key") == visibility_key and bool(motion.get("masked")))
+
+
 def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings of a section that keys are made of: one that needs another counts only beside it."""
-    if settings.get("masks") == AUTO_MASKS:
-        settings = settings | {"masks": CaptureOptions.masks}
     ignored = {("capture", "path"), *(each for each, needed in REQUIRED_SETTINGS.items() if not settings.get(needed))}
     return {name: value for name, value in settings.items() if (section, name) not in ignored}

@@ -70,7 +70,7 @@ def make_sfm_request(request: RunRequest) -> SfmRequest:
     for flag, value in (("--georef", options.georef), ("--up", None if options.up == "auto" else options.up)):
         if value is not None:
             raise VdgsError(f"{flag} is about a capture's world; photographs get theirs from their positions (--gps).")
-    if options.mask_folder != CaptureOptions.masks:
+    if options.masks != CaptureOptions.masks:
         raise VdgsError(
             f"--masks {options.masks}: names a folder of a capture. Masks of photographs alone are those in "
             f"{CaptureOptions.masks}/ beside them: rename the folder."

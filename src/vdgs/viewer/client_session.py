@@ -152,11 +152,9 @@ class ClientSession:
             self._show_legend(frame.display)
 
     def _show_legend(self, display: DisplayOptions) -> None:
-        if display.layer in ("color", "blocks"):
-            self._legend.visible = False
-            return
         scale = self.painter.scale(display)
         if scale is None:
+            self._legend.visible = False
             return
         key = (display.layer, display.model, scale.low, scale.high)
         if self._legend_key != key:
@@ -208,6 +206,10 @@ class ClientSession:
             "Seen by at least", 0, _MAX_MIN_VISIBILITY, 1, 0, hint="Leave out what fewer photographs show: the edge"
         )
         trust.on_update(lambda _: self.change_display(min_visibility=int(trust.value)))
+        marks = gui.add_checkbox(
+            "Where trust ends", False, hint="Color what one photograph or none shows red, what two show yellow"
+        )
+        marks.on_update(lambda _: self.change_display(mark_trust=bool(marks.value)))
         self._build_views()
         self._build_overlays()
         self.point_panel = PointPanel(self)

@@ -33,8 +33,10 @@ Layer = Literal["color", "depth", "visibility", "alpha", "blocks", "error"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 #: Errors from here on have the color of the end, as a share of full brightness (choice).
 _MAX_ERROR = 0.25
-#: How much of the color is that of the block.
+#: How much of the color is that of the block, or of a mark.
 _TINT_STRENGTH = 0.6
+#: What is marked where trust ends: places that fewer than two training cameras see, and two, RGB (choice).
+TRUST_MARKS = ((0.85, 0.05, 0.25), (1.0, 0.72, 0.0))
 #: The range of depths is found in an image so wide.
 _PREVIEW_PX = 160
 #: Of the line between two images.
@@ -56,6 +58,8 @@ class DisplayOptions:
     full_detail: bool = False
     #: What fewer training cameras see is not drawn.
     min_visibility: int = 0
+    #: In the layer `color`: mark what fewer than three training cameras see.
+    mark_trust: bool = False
 
 
 class Painter:
@@ -95,6 +99,8 @@ class Painter:
             return scalar_maps.visibility_scale(self._scene.visibility_sample(name).cpu().numpy())
         if display.layer == "alpha":
             return scalar_maps.alpha_scale()
+        if display.layer == "color" and display.mark_trust:
+            return trust_scale()
         return error_scale() if display.layer == "error" else None
 
     def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int:
@@ -131,7 +137,10 @@ class Painter:
         self.drawn_anchors += count
         if display.layer == "color":
             shown = without_aliasing(level.model, self._scene.pixel_at_camera_height)
-            return to_8bit(render(shown, camera).image.cpu().numpy())
+            image = render(shown, camera).image
+            if display.mark_trust:
+                image = _with_trust_marks(image, shown, self._scene.level_visibility(name, level, camera), camera)
+            return to_8bit(image.cpu().numpy())
         if display.layer == "blocks":
             return _render_block_tints(level.model, self._scene.level_tint(name, level, camera), camera)
         if display.layer == "depth" and self._depth is None:
@@ -196,6 +205,30 @@ def _render_block_tints(model: Drawable, tints: Tensor, camera: Camera) -> UInt8
     background = splats.means_px.new_tensor(model.background)
     raster = rasterize_splats(replace(splats, colors=colors.contiguous()), camera, background)
     return to_8bit(raster.image.cpu().numpy())
+
+
+@torch.no_grad()
+def _with_trust_marks(image: Tensor, model: Drawable, visibility: Tensor, camera: Camera) -> Tensor:
+    """A picture [h, w, 3] of a model, colored by as much as what few training cameras see makes of each pixel."""
+    rows, splats = view_splats(model, camera)
+    seen, marks = visibility[rows][:, None], image.new_tensor(TRUST_MARKS)
+    is_marked = torch.cat([seen < 2, seen == 2, torch.zeros_like(seen, dtype=torch.bool)], dim=1).to(image.dtype)
+    parts = rasterize_splats(replace(splats, colors=is_marked), camera, image.new_zeros(3)).image[..., :2]
+    parts = _TINT_STRENGTH * parts
+    return image * (1 - parts.sum(dim=-1, keepdim=True)) + parts @ marks
+
+
+def trust_scale() -> ColorScale:
+    """What the marks mean, by V."""
+    from vdgs.rendering.scalar_maps import ColorScale
+
+    colors = np.array([*TRUST_MARKS, (1.0, 1.0, 1.0)])
+    ticks = tuple((float(seen), f"≥ {seen}, as it is" if seen == 3 else str(seen)) for seen in range(4))
+    titles = ("training cameras that see the place, V", "training cameras, V", "V")
+    return ColorScale(
+        titles=titles, low=-0.5, high=3.5, ticks=ticks, has_nodata=False,
+        colormap=lambda values: colors[np.clip(np.rint(values).astype(int) - 1, 0, 2)],
+    )  # fmt: skip
 
 
 def error_scale() -> ColorScale:

@@ -7,7 +7,7 @@ own cameras.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -60,6 +60,8 @@ class InitialView:
     title: str = "scene"
     #: The file may have so many bytes.
     max_bytes: int = 30_000_000
+    #: How many training cameras see places [n, 3] in these coordinates, V; None: not known.
+    count_visibility: Callable[[Tensor], Tensor] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

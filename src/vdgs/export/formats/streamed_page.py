@@ -2,7 +2,7 @@
 
 `index.html` is the page, without anything from elsewhere; `scene.json` holds the view and a quadtree
 (`lod_quadtree`), whose nodes lie in a folder beside it as the page's texture holds them: 32 bytes for each Gaussian, as
-in `.html`. Colors do not change with the direction.
+in `.html`, with V in the number that is free there. Colors do not change with the direction.
 """
 
 from __future__ import annotations
@@ -57,14 +57,17 @@ def write_streamed_page(path: Path, scene: ExportScene, node_size: int = MAX_NOD
         factor, page = length_factor(sample), scene.page or default_page_view(sample)
 
         def write_node(gaussians: Gaussians, name: str) -> str:
-            write_bytes(folder / f"{name}.bin", packed_rows(gaussians, factor).tobytes())
+            rows = packed_rows(gaussians, factor)
+            if page.count_visibility is not None:
+                rows[:, 3] = page.count_visibility(gaussians.means).numpy()
+            write_bytes(folder / f"{name}.bin", rows.tobytes())
             return f"{folder.name}/{name}.bin"
 
         root = build_tile_quadtree(store, write_node, node_size)
         write_bytes(path.with_name(PAGE_FILE), _PAGE.read_bytes())
         facts = {**scene.metadata.to_dict(), "axes": "z up"}
         view = {"position": page.position, "target": page.target, "fov_deg": FOV_DEG, "background": page.background,
-                "title": page.title}  # fmt: skip
+                "title": page.title, "visibility": page.count_visibility is not None}  # fmt: skip
         return {
             "asset": {"version": 1, "generator": scene.metadata.program, "extras": facts}, "gaussians": scene.count,
             "factor": factor, "view": view, "root": root.entry,
