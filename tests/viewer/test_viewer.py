@@ -21,9 +21,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.exposure import exposure_matrix
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
-from vdgs.model.renderer import render, without_aliasing
 from vdgs.model.renderer import render, render_scalar_map, without_aliasing
-from vdgs.partition.blocks import save_blocks
 from vdgs.pipeline import build_lod
 from vdgs.viewer import viewer_scene
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image

@@ -8,7 +8,7 @@ anchors/N.safetensors   the anchors of leaf N, with their rows in the model
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +147,7 @@ def _read(path: Path, kind: type[Gaussians] | type[Anchors]) -> dict[str, Tensor
         tensors = read_tensors_unchecked(path)
         if _header(path)["crc32"] != tensors_crc32(tensors):
             raise ValueError("its checksum does not agree")
-        if missing := {each.name for each in fields(kind)} - set(tensors):
+        if missing := {each.name for each in fields(kind) if each.default is MISSING} - set(tensors):
             raise ValueError(f"it has no {', '.join(sorted(missing))}")
         return tensors
     except (OSError, ValueError, KeyError, TypeError) as error:
