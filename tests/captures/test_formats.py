@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from support.captures import TinyScene, moved, tiny_scene, to_source, write_colmap, write_images, write_ply
 from support.dataset_layouts import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
@@ -20,6 +21,7 @@ from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import Intrinsics
+from vdgs.captures.image_files import decode_mask
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -527,6 +529,37 @@ def test_paths_of_another_machine_are_those_of_the_captures_files(tmp_path, scen
 def test_a_path_outside_the_capture_is_called_what_it_is(tmp_path, scene):
     write_transforms(tmp_path, scene, ply_file_path="/elsewhere/cloud.ply")
     with pytest.raises(CaptureError, match=r"the ply_file_path '/elsewhere/cloud\.ply' is not a path inside"):
+        load_capture(tmp_path)
+
+
+def test_single_poses_that_are_none_are_left_out_and_masks_of_instant_ngp_are_turned_round(tmp_path, scene):
+    write_transforms(tmp_path, scene, k1=-0.05)
+    file = tmp_path / "transforms.json"
+    content = json.loads(file.read_text())
+    names = [frame["file_path"] for frame in content["frames"]]
+    content["frames"][1]["transform_matrix"][0][3] = float("nan")
+    content["frames"].append(dict(content["frames"][2]))  # the same once more
+    file.write_text(json.dumps(content))
+    light = np.zeros((48, 64), np.uint8)
+    light[:, :16] = 30  # not bright, but not black
+    mask = tmp_path / names[0]
+    Image.fromarray(light).save(mask.with_name(f"dynamic_mask_{mask.stem}.png"))
+    capture = load_capture(tmp_path)
+    assert len(capture.views) == len(names) - 1
+    assert any(
+        "left out, for the pose cannot be used. frame 'images/frame_001.png'" in note for note in capture.warnings
+    )
+    masked = next(view for view in capture.views if view.name == "frame_000.png")
+    assert masked.mask_path is not None
+    kept = decode_mask(masked.mask_path, masked.camera.width, masked.camera.height)
+    assert not kept[:, : kept.shape[1] // 6].any()
+    assert kept[:, kept.shape[1] // 3 :].all()
+    with pytest.raises(CaptureError, match="finite numbers"):
+        load_capture(tmp_path, CaptureOptions(strict=True))
+    content["frames"][0]["transform_matrix"] = (2 * np.eye(4)).tolist()
+    content["frames"][3]["transform_matrix"] = []
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="orthonormal"):
         load_capture(tmp_path)
 
 

@@ -245,6 +245,73 @@ def test_systems_are_known_by_all_their_names(tmp_path, header, code):
     assert to_geodetic("WGS84 longlat", tmp_path)[0](np.array([[7.0, 50, 5]])) == pytest.approx(np.array([[50, 7, 5]]))
 
 
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ("name,Lat(deg),Long(deg),EllHgt(m)", "-33.5,-70.6,500"),
+        ("name,lat,lon,agl,alt_msl", "-33.5,-70.6,60,500"),
+        ("name,lat (rad),lon (rad),Orthometric elevation", "-0.5846852994181004,-1.2322024519637,500"),
+        ("name,lat,lon,alt", "33.30.00.000S,70.36.00W,500"),
+        ("name,lat,lon,alt", "3330.0000 S,07036.0000 W,500"),
+        ("name,lat,lat ref,lon,lon ref,alt", "3330.0000,S,07036.0000,W,500"),
+        ("OBJECTID,Name,POINT_X,POINT_Y,POINT_Z", None),  # degrees without a system: a.jpg and others of one place
+    ],
+)
+def test_more_names_and_angles_are_read(tmp_path, names, words):
+    file = tmp_path / "table.csv"
+    rows = [f"a.jpg,{words}"] if words else [f"{k},{'abc'[k]}.jpg,{-70.6 + k / 1e4},-33.5,500" for k in range(3)]
+    file.write_text("\n".join([names, *rows]))
+    table = read_gps_table(file)
+    assert table.rows[0].position == pytest.approx((-33.5, -70.6, 500), abs=1e-7)
+    assert ("look like longitude and latitude" in "".join(table.notes)) is (words is None)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,lat,lon,alt\na.jpg,-335000811,-706001452,5", "degrees times 10,000,000"),
+        ("name,lat,lon,alt\na.jpg,-3330.004868,-7036.008716,5", "ddmm.mmmm"),
+        ("name,lat,lon,alt\na.jpg,33.30.00.1.2,70.3.2,5", "are not numbers"),
+    ],
+)
+def test_angles_that_are_no_degrees_are_told(tmp_path, text, message):
+    (tmp_path / "table.csv").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        read_gps_table(tmp_path / "table.csv")
+
+
+@pytest.mark.parametrize(("x", "y"), [('"351,362.43"', '"6,292,126.02"'), ("351.362,43", "6.292.126,02")])
+def test_signs_between_thousands_are_read_where_they_are_clear(tmp_path, x, y):
+    sign = "," if x.startswith('"') else ";"
+    for end in ("", " # survey of May"):
+        (tmp_path / "t.csv").write_text(
+            f"EPSG:32719{end}\n" + sign.join(["name", "x", "y"]) + f"\na.jpg{sign}{x}{sign}{y}"
+        )
+        plain = tmp_path / "plain.csv"
+        plain.write_text("EPSG:32719\nname,x,y\na.jpg,351362.43,6292126.02")
+        assert read_gps_table(tmp_path / "t.csv").rows[0].position[:2] == read_gps_table(plain).rows[0].position[:2]
+
+
+@pytest.mark.parametrize(
+    ("system", "names", "factors"),
+    [
+        ("EPSG:32719", "name,E [km],N [km],h [cm]", (1e-3, 1e-3, 100)),
+        ("EPSG:32719", "name,X_ft,Y_ft,Z_ft", (1 / 0.3048,) * 3),
+        ("EPSG:2225", "name,easting (ft),northing (US survey ft),z (m)", (1, 1, 1)),  # the system's own feet
+    ],
+)
+def test_units_of_the_columns_of_x_and_y_count(tmp_path, system, names, factors):
+    given = np.array([2_000_000.0, 600_000, 80]) if system == "EPSG:2225" else np.array([EASTING, NORTHING, 500.0])
+    plain, named = tmp_path / "plain.csv", tmp_path / "named.csv"
+    plain.write_text(f"{system}\nname,x,y,z\na.jpg,{','.join(map(repr, given.tolist()))}\n")
+    named.write_text(f"{system}\n{names}\na.jpg,{','.join(map(repr, (given * factors).tolist()))}\n")
+    (wanted,), (found,) = read_gps_table(plain).rows, read_gps_table(named).rows
+    assert found.position == pytest.approx(wanted.position, abs=1e-9)
+    named.write_text(f"EPSG:4326\n{names}\na.jpg,0.01,0.02,5\n")
+    with pytest.raises(CaptureError, match="unit of length, but EPSG:4326 counts in degrees"):
+        read_gps_table(named)
+
+
 def test_degrees_under_a_system_in_metres_are_refused(tmp_path):
     rows = [f"{name} {PLACE[0] + k / 9000:.8f} {PLACE[1]:.8f} 500" for k, name in enumerate(NAMES)]
     (tmp_path / "geo.txt").write_text("\n".join(["EPSG:32719", *rows]))

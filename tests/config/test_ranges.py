@@ -19,6 +19,7 @@ from vdgs.cli.run_cmd import RunArguments, TrainCoarseArguments
 from vdgs.cli.stage_cmds import MergeArguments, PartitionArguments, TrainBlocksArguments
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig, PartitionConfig
+from vdgs.config.options import options_of
 from vdgs.config.presets import PRESETS
 from vdgs.config.ranges import NumericSetting, Range, check_ranges, find_range_errors, iter_numbers
 from vdgs.config.serialization import from_dict, to_dict
@@ -64,6 +65,35 @@ def test_numbers_are_found_wherever_they_stand():
     assert next(each for each in iter_numbers(auto) if each.path == ("blocks",)) == NumericSetting(
         ("blocks",), None, Range(1, 10_000)
     )
+
+
+@pytest.mark.parametrize(
+    ("kind", "flag", "word", "value"),
+    [
+        (RunArguments, "--iterations", "1e3", 1000),
+        (RunArguments, "--iterations", "30_000", 30_000),
+        (RunArguments, "--iterations", "30,000", 30_000),
+        (RunArguments, "--iterations", "2.5k", 2500),
+        (RunArguments, "--iterations", "30.000", None),  # thirty thousand to half of the world
+        (RunArguments, "--iterations", "1e400", None),
+        (RunArguments, "--blocks", "auto", "auto"),
+        (RunArguments, "--downscale", "1,5", 1.5),
+        (RunArguments, "--downscale", "1,500", None),
+        (RunArguments, "--downscale", "50%", None),
+        (SynthArguments, "--overlap", "70%", 0.7),
+        (SynthArguments, "--extent-m", "12000cm", 120.0),
+        (OrthoArguments, "--bbox", "832300,619770,832400.5,619850", (832300.0, 619770.0, 832400.5, 619850.0)),
+        (OrthoArguments, "--gsd", "5cm", None),  # the map may count in feet
+    ],
+)
+def test_numbers_are_read_as_people_write_them_where_they_are_clear(kind, flag, word, value):
+    option = next(each for each in options_of(kind) if each.flag == flag)
+    if value is None:
+        with pytest.raises(ValueError, match=f"^{word}: must be a .*number; write such as"):
+            option.read([word])
+    else:
+        assert option.read([word]) == value
+        assert type(option.read([word])) is type(value)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300])

@@ -23,10 +23,12 @@ from vdgs.captures.reconstruction import gcp_table, read_reconstruction, report_
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.sfm import incremental_mapper
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
+from vdgs.system.lazy_pycolmap import pycolmap
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]
 
@@ -149,11 +151,22 @@ def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
     for encoding, rows in ways:
         file.write_bytes("\r\n".join(rows).encode(encoding))
         assert read_gcp_list(file, collection, ()).points == sound.points
+    units = [
+        [f"{float(x) / 1e3!r}", f"{float(y) / 1e3!r}", f"{float(z) / 0.3048!r}", *rest] for x, y, z, *rest in lines
+    ]
+    named = [",".join([*line[:-1], f"CHK-{line[-1]}"]) for line in units]
+    file.write_text("\n".join([f"{head[0]} # of May", "x [km],y [km],z (ft),px,py,photograph,name", *named]))
+    found = read_gcp_list(file, collection, ())
+    assert all(point.is_check_point for point in found.points)
+    assert "held out as check points" in "".join(found.notes)
+    places = [np.array([point.geodetic for point in each.points]) for each in (found, sound)]
+    assert places[0] == pytest.approx(places[1], abs=1e-6)
 
 
 BAD = {
     "nothing": ("", "is empty"),
     "no system": (None, "must name the coordinate system"),
+    "XML": ("<?xml version='1.0'?>\n<document version='2.1'><markers/></document>", "must name the coordinate system"),
     "no such system": ({"header": "EPSG:999999"}, "must name the coordinate system"),
     "a word for a number": ([{"text": "1 2 three 4 5 DJI_0001.JPG"}], "line 2: .* is not `x y z px py photograph"),
     "columns in another order": ([{"text": "lat lon alt px py photo"}], "line 2: .* another order than `x y z px py"),
@@ -307,14 +320,32 @@ def test_a_point_that_does_not_fit_and_marks_that_are_wrong_are_named(made, flig
     assert pytest.approx(facts.height_m, abs=4) == ALTITUDE_M
 
 
-@pytest.mark.parametrize("flip", ["exchanged", "from the lower edge"])
+@pytest.mark.parametrize(("spread", "held"), [(incremental_mapper.MIN_HEIGHT_SPREAD, True), (0.0, False)])
+def test_a_focal_length_that_altitudes_leave_open_is_fitted_where_the_model_shows_several_heights(
+    made, monkeypatch, spread, held
+):
+    model = pycolmap.Reconstruction(made / "mapped")
+    before = [camera.params.copy() for camera in model.cameras.values()]
+    monkeypatch.setattr(incremental_mapper, "MIN_HEIGHT_SPREAD", spread)  # any height is another one
+    found = incremental_mapper.release_focal([model], (True, incremental_mapper.OF_FLIGHTS), 1)
+    assert found[0] is held
+    after = [camera.params for camera in model.cameras.values()]
+    assert np.array_equal(before, after) is held
+    assert incremental_mapper.release_focal([model], (False, "asked for"), 1) == (False, "asked for")
+
+
+@pytest.mark.parametrize("flip", ["exchanged", "from the lower edge", "of half the size"])
 def test_marks_that_are_read_wrongly_are_refused_and_the_capture_stays(made, flight, points, tmp_path, flip):
     def wrong(pixel: np.ndarray) -> np.ndarray:
+        if flip == "of half the size":
+            return pixel / 2
         return pixel[::-1] if flip == "exchanged" else np.array([pixel[0], HEIGHT - pixel[1]])
 
     marked = [{k: p if k < 0 else wrong(p) for k, p in seen.items()} for seen in points]
     marked = [{k: p for k, p in seen.items() if k < 0 or p[1] <= HEIGHT} for seen in marked]
-    with pytest.raises(CaptureError, match=r"px and py change places|py counts from the lower edge"):
+    with pytest.raises(
+        CaptureError, match=r"px and py change places|py counts from the lower edge|photographs of another size"
+    ):
         surveyed(made, flight, tmp_path, write_list(tmp_path / "gcp_list.txt", flight, marked))
     assert load_capture(tmp_path / "capture").ground.metric
 

@@ -17,6 +17,7 @@ from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm import georegistration
 from vdgs.sfm.georeferencing import FOOT_M, Doubts
 from vdgs.sfm.georegistration import Georegistration
+from vdgs.sfm.gps_priors import GpsPriors
 
 pytestmark = pytest.mark.slow
 
@@ -129,6 +130,36 @@ def test_heights_of_a_barometer_are_as_high_above_the_sea_as_altitudes_tell(drif
         assert barometer
         assert off <= fit.place_error_m[1] < 2 * drift_m
         assert off > 0.3 * drift_m
+
+
+@pytest.mark.parametrize("datum_m", [0.0, 20.0, 48.0])
+@pytest.mark.parametrize("flown", ["beside each other", "over each other"])
+def test_altitudes_of_flights_that_differ_by_a_datum_tilt_nothing_and_are_said(datum_m, flown):
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        places = strips(6, 6, 20.0, rng)
+        flights = np.arange(36) // 18 if flown == "beside each other" else np.arange(36) // 6 % 2
+        recorded = places + rng.normal(0, 1.0, places.shape)
+        recorded[:, 2] += datum_m * flights
+        problem, turn = problem_of(places, recorded, seed)
+        positions = GpsPriors(
+            image_indices=np.arange(36), enu=recorded, gps_std=np.ones((36, 3)), origin=(0.0, 0.0, 0.0),
+            altitude_reference="", source="EXIF", notes=(), flights=flights,
+        )  # fmt: skip
+        levelled, offsets = georegistration._without_offsets(problem, positions, np.arange(36))
+        fit = fit_positions(levelled)
+        assert fit.altitude == "used"
+        assert tilt_deg(fit, turn) <= fit.level_error_deg
+        if not datum_m:
+            assert offsets is None
+            continue
+        assert abs(offsets.different[0]) == pytest.approx(datum_m, abs=2.0)
+        across, up = georegistration._with_datum(fit, offsets, np.ones(36))
+        assert (across, up >= datum_m - 2) == (fit.place_error_m[0], True)
+        # A flight with RTK beside one without says what is right.
+        stated = np.where(flights == flights[~offsets.reference][0], 3.0, 0.02)
+        assert georegistration._with_datum(fit, offsets, stated) == fit.place_error_m
+        assert f"{offsets.different[0]:+.0f} m (18 photographs)" in georegistration._of_offsets(offsets, fit)[0]
 
 
 @pytest.mark.parametrize("wrong_m", [0.0, 3.0])
@@ -282,6 +313,7 @@ def doubts(gps: bool = True, recorded: float | None = HEIGHT_M, altitude: float 
         similarity=here,
         method="GPS",
         position_rows=rows,
+        targets=np.zeros((len(rows), 3)),
         residuals=np.zeros_like(centers),
         inliers=np.ones(len(centers), bool),
         accuracy=accuracy,

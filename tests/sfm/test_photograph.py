@@ -346,6 +346,7 @@ def strips(count: int, each: int) -> np.ndarray:
         pytest.param(strips(5, 8), 1.0, True, id="a survey"),
         pytest.param(strips(2, 20), 0.5, True, id="there and back"),
         pytest.param(strips(3, 3), 0.5, True, id="nine photographs"),
+        pytest.param(strips(5, 8) + np.outer(np.arange(40) // 20, [0, 0, 48]), 1.0, True, id="another datum"),
         pytest.param(strips(1, 20), 0.5, False, id="a line"),
         pytest.param(circle(30.0), 0.5, False, id="around a house"),
         pytest.param(circle(30.0) * [1, 0.3, 1], 0.5, False, id="around a long house"),
@@ -364,6 +365,8 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
     photographs = [silent] * (10 if places is None else len(places))
     where = positions_of(photographs)
     if places is not None:
+        flights = (places[:, 2] // 40).astype(int) if np.ptp(places[:, 2]) == 48 else 0 * where.flights
+        where = replace(where, flights=flights)
         enu = places + np.random.default_rng(3).normal(0, wrong_m, places.shape)
         where = replace(where, image_indices=np.arange(len(enu)), enu=enu, gps_std=np.tile([1.0, 1, 2], (len(enu), 1)))
     assert should_fix_focal(photographs, where, SfmOptions())[0] is held

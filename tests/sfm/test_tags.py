@@ -13,7 +13,8 @@ from PIL.TiffImagePlugin import IFDRational
 from support.flights import add_xmp, write_photograph
 from vdgs.captures.angles import degrees_of_text
 from vdgs.config.sfm_options import SfmOptions
-from vdgs.sfm.exif_gps import read_altitude, read_place
+from vdgs.sfm.cross_checks import cross_checked, strays
+from vdgs.sfm.exif_gps import other_datum, read_altitude, read_altitudes, read_place
 from vdgs.sfm.feature_extraction import group_by_camera
 from vdgs.sfm.focal_length import AGREE, EQUIVALENT, SENSOR, read_lens
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -171,6 +172,36 @@ def test_an_altitude_gives_way_to_no_default_and_not_where_another_source_confir
     assert read_altitude({5: b"\x00", 6: 50.6}, packet(f'{heights}"+90.00"'))[0] == 50.6  # near the height by chance
     found = read_altitude({5: b"\x00", 6: 0.0}, packet(f'{heights}"+90.00" drone-dji:AltitudeType="RtkAlt"'))
     assert found == (90.0, "AbsoluteAltitude in XMP (RtkAlt) as recorded")
+
+
+def test_altitudes_are_exchanged_by_flight_and_not_by_photograph(tmp_path):
+    """EXIF's are those over an ellipsoid, near the heights over the take-off in one photograph, and 0 in another."""
+    seen = []
+    for k, (in_exif, over) in enumerate([(50.0, 47.0), (51.0, 48.0), (50.5, 50.4), (0.0, 47.5), (50.2, 47.1)]):
+        xmp = packet(f'drone-dji:RelativeAltitude="+{over}" drone-dji:AbsoluteAltitude="+{over + 45}"')
+        taken, both = read_altitudes({5: b"\x00", 6: in_exif}, xmp)
+        seen.append(replace(photograph(tmp_path, k), altitude=taken[0], altitude_type=taken[1], altitudes=both))
+    assert [photo.altitude for photo in seen] == [50, 51, 95.4, 92.5, 50.2]
+    checked = cross_checked(seen)
+    assert [photo.altitude for photo in checked] == pytest.approx([50, 51, 50.5, 92.5 - 42.0, 50.2], abs=0.1)
+    assert len({photo.altitude_type for photo in checked}) == 1
+    alone = [replace(photo, datetime=f"2026:06:{1 + (k == 2):02d} 10:00:00") for k, photo in enumerate(seen)]
+    assert cross_checked(alone)[2].altitude == 95.4  # of another flight
+
+
+def test_cut_photographs_have_the_focal_length_of_the_others_in_pixels_and_copies_are_told(tmp_path):
+    seen = [photograph(tmp_path, k) for k in range(4)]
+    longer, short = max(seen[0].size), min(seen[0].size)
+    cut = replace(seen[3], width=longer - 20, height=short)
+    checked = cross_checked([*seen[:3], cut])
+    assert checked[3].lens.focal * (longer - 20) == pytest.approx(seen[0].lens.focal * longer)
+    assert "cut to another shape" in checked[3].doubts[-1]
+    assert not any(photo.doubts for photo in checked[:3])
+    copy = replace(seen[0], name="p00 (1).jpg")
+    assert list(strays([*seen, copy, replace(copy, name="p00-edited.jpg")])[0]) == ["p00 (1).jpg", "p00-edited.jpg"]
+    assert strays([*seen, replace(copy, datetime="2026:06:02 10:00:00")])[0] == {}  # of another moment
+    assert "TOKYO" in other_datum({0x12: "TOKYO", 2: (1, 2, 3)})
+    assert other_datum({0x12: "WGS-84", 2: (1, 2, 3)}) == other_datum({}) == ""
 
 
 def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():

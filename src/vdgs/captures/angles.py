@@ -8,6 +8,8 @@ import unicodedata
 from collections.abc import Sequence
 
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
+#: Degrees, minutes and seconds with points between them, and NMEA's degrees and minutes in one number.
+_POINTS, _NMEA = re.compile(r"([+-]?\d{1,3})\.(\d{1,2})\.(\d{1,2}(?:\.\d+)?)"), re.compile(r"(\d{2,3})(\d\d\.\d+)")
 #: Words that degrees, minutes and seconds may be written with.
 _UNITS = re.compile(r"degrees?|deg|minutes?|min|seconds?|sec", re.IGNORECASE)
 #: First letters of the words for south and west, north and east, in the axis that they belong to.
@@ -53,6 +55,10 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     # In XMP `33,30.02` has degrees and minutes; in a table `33,5` is decimal.
     if plain.count(",") and ("." in plain or plain.count(",") > 1 or side is not None):
         plain = plain.replace(",", " ")
+    if found := _POINTS.fullmatch(plain) or (_NMEA.fullmatch(plain) if side is not None else None):
+        plain = " ".join(found.groups())
+    if re.search(r"[.,]", _NUMBER.sub("", plain)):
+        return None
     words = _NUMBER.findall(plain)
     value = degrees_of_parts([float(word.replace(",", ".")) for word in words])
     if value is None or not math.isfinite(value):

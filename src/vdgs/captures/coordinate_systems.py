@@ -67,7 +67,7 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         x, y, z = places.T
-        if crs.is_projected and _look_like_degrees(places[:, :2]):
+        if crs.is_projected and look_like_degrees(places[:, :2]):
             raise CaptureError(
                 f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} look like degrees, but {crs.name} ({where}) "
                 "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
@@ -85,14 +85,14 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
     ellipsoid = crs.ellipsoid.name if unknown and crs.ellipsoid is not None else "WGS 84"
     if ellipsoid not in _GLOBAL:
         name += (
-            f" (ellipsoid {ellipsoid} but no datum: taken as WGS 84, from which national datums differ by up "
-            "to some hundred metres; an EPSG code, or +towgs84, names it)"
+            f"; ellipsoid {ellipsoid} but no datum: taken as WGS 84, from which national datums differ by up "
+            "to some hundred metres (an EPSG code, or +towgs84, names it)"
         )
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
     return changed, f"{name}; x and y in feet, heights are taken as metres" if feet else name
 
 
-def _look_like_degrees(places: np.ndarray) -> bool:
+def look_like_degrees(places: np.ndarray) -> bool:
     """Whether x and y [n, 2] are latitudes and longitudes of one place: as metres they would be one and the same."""
     if len(places) < 3 or (np.abs(places) > [180, 180]).any():
         return False
@@ -121,6 +121,20 @@ def is_in_degrees(header: str) -> bool:
     return bool(pyproj.CRS.from_user_input(_named(header)).is_geographic)
 
 
+def in_units_of(header: str, meters: float, file: Path) -> float:
+    """Units of x and y of a system that `to_geodetic` knows in one of a column whose name says so many `meters`; 1 for
+    a column that says metres, or nothing. Raises CaptureError for a system in degrees."""
+    if meters == 1:
+        return 1.0
+    import pyproj
+
+    axis = pyproj.CRS.from_user_input(_named(header)).axis_info[0]
+    if axis.unit_name.startswith("deg"):
+        raise CaptureError(f"{file}: its columns name a unit of length, but {header[:60]} counts in degrees.")
+    factor = meters / float(axis.unit_conversion_factor)
+    return 1.0 if abs(factor - 1) < 1e-5 else factor  # feet, of the survey or not, are those of the system
+
+
 def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
     """What brings Earth-centred metres of the datum of a system to latitude, longitude and height of WGS 84."""
     if re.search(r"EPSG:4326|GEOG(CS|CRS|RAPHICCRS)\[\s*\"WGS[ _]?(19)?84", header, re.I):
@@ -147,7 +161,7 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
 
 def _named(header: str) -> str:
     """ODM's own words for systems, `WGS84`, `WGS84 longlat` and `WGS84 UTM 15N`, as codes; others as they are."""
-    header = re.sub(r"(?i)^(crs|srs)\s*:", "", header.strip(_AROUND)).strip()
+    header = re.sub(r"(?i)^(crs|srs)\s*:|\s#.*", "", header.strip(_AROUND)).strip()
     if _LONGITUDE_LATITUDE.fullmatch(header):
         return "EPSG:4326"
     zone = _UTM.fullmatch(header)

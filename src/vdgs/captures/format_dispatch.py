@@ -157,7 +157,8 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
     images, image_warnings = image_folder(root, options)
     if has_both_kinds(folder):
         warnings.append(f"{folder.relative_to(root) / 'images.bin'} is read; images.txt beside it is not.")
-    model = read_colmap(folder)
+    model = read_colmap(folder, options.strict)
+    warnings += model.notes
     if not model.views:
         raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
     points, colors = model.points, model.colors

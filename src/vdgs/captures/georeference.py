@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.gps_tables import GpsRow, by_number, check_geodetic, read_gps_table, with_altitudes
+from vdgs.captures.gps_tables import GpsRow, check_geodetic, read_gps_table, with_altitudes
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 
 #: What georef.json calls a world that has its place on Earth, and one that only has metres and up.
 ENU_FRAME, LOCAL_FRAME = "ENU, metres, x east y north z up", "local, metres, z up; no place on Earth"
 ORIGIN_KEYS = ("origin_lat_deg", "origin_lon_deg", "origin_alt_m")
+_ENDING = re.compile(r"\.[A-Za-z]{3,4}$")
 _Find = Callable[[str], tuple[tuple[int, int], list[int]]]
 
 
@@ -75,6 +77,16 @@ def _accuracy(content: Mapping[str, object]) -> str:
     return ""
 
 
+def _by_number(names: Sequence[str]) -> _Find:
+    """What finds photographs by the number that DJI gives them: the last group of four digits of their names."""
+    found: dict[int, list[int]] = {}
+    for index, name in enumerate(names):
+        digits = re.findall(r"(?<!\d)\d{4}(?!\d)", _ENDING.sub("", name.rpartition("/")[2]))
+        if digits:
+            found.setdefault(int(digits[-1]), []).append(index)
+    return lambda number: ((0, 0), found.get(int(number), []) if number.isdecimal() else [])
+
+
 def match_gps(names: Sequence[str], file: Path) -> tuple[np.ndarray, np.ndarray, bool]:
     """Indices [m] of the images that a table has a position of, the positions [m, 3] (latitude, longitude, altitude),
     and whether their altitudes are known (0 where not).
@@ -98,7 +110,7 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
     """
     lookup = NameLookup((name, index) for index, name in enumerate(names))
     if numbered:
-        found = _best_rows(names, rows, by_number(names), file)
+        found = _best_rows(names, rows, _by_number(names), file)
     else:
         found = _best_rows(names, rows, lookup.find, file) or _best_rows(names, rows, lookup.find_elsewhere, file)
     if not found:

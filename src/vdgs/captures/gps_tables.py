@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-import unicodedata
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -17,8 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vdgs.captures.angles import degrees_of_text
-from vdgs.captures.coordinate_systems import names_a_system, to_geodetic
+from vdgs.captures.angles import LIMITS, degrees_of_text
+from vdgs.captures.coordinate_systems import in_units_of, look_like_degrees, names_a_system, to_geodetic
+from vdgs.captures.table_columns import ANGLES, RADIANS, known_columns, meters_of, number_of
 from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
 from vdgs.errors import CaptureError
 
@@ -38,56 +38,14 @@ _OTHERS = (
         "is JSON. Export a table instead: `exiftool -csv -n -GPS* PHOTOGRAPHS`, or ODM's geo.txt.",
     ),
 )
-#: What each column is called, once blanks, signs, accents, units and the case of letters are taken away.
-_COLUMNS: dict[str, frozenset[str]] = {
-    what: frozenset(names.split())
-    for what, names in {
-        "name": "name label image imagename imagefile imagefilename filename file sourcefile photo photoname "
-        "photograph picture picturename img imgname path filepath imagepath cameraname photolabel "
-        "dateiname bildname bild nombre imagen fichier nomdufichier nomefile 照片名称 文件名 名称",
-        "lat": "lat latitude gpslatitude gpslat ylatitude latitudey latitudedeg latdeg wgs84lat wgs84latitude "
-        "latitudewgs84 ylat cameralatitude originallatitude breite breitengrad latitud latitudine 纬度",
-        "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
-        "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude lange langengrad "
-        "longitud longitudine 经度",
-        "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
-        "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
-        "heightellipsoid ellh elevationm altft altitudeft altitudefeet heightft hohe altitud altura quota 高度 海拔",
-        "x": "x easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
-        "y": "y northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
-        "nordwert norte",
-        "latref": "latref latituderef gpslatituderef",
-        "lonref": "lonref longituderef gpslongituderef",
-        "altref": "altref altituderef gpsaltituderef",
-        "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror accuracyxy errorxy "
-        "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy",
-        "eastwards": "rmseasting eastingrms sde stddeve sigmae accuracyxeasting accuracyxlongitude accuracyx",
-        "northwards": "rmsnorthing northingrms sdn stddevn sigman accuracyynorthing accuracyylatitude accuracyy",
-        "upwards": "accuracyvertical verticalaccuracy vacc accuracyv vdev verticalerror accuracyz errorz "
-        "verticalaccuracym zaccuracy rmselevation elevationrms sdu stddevu sigmau accuracyzaltitude",
-        "system": "epsg crs srs epsgcode",
-    }.items()
-}  # fmt: skip
 _DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
-_UNIT = re.compile(
-    r"[\[(][^\])]*[\])]|[_ ](?:decimal degrees|dd|deg|degrees|m|met(?:er|re)s?|(?:us[ _]?)?f(?:oo|ee)?t)$"
-)
-#: How the names of columns, and values, say that they are feet.
-_FEET = re.compile(r"(?:[\[( _\d]|^alt|^altitude|^height)(us[ _]?(?:survey[ _]?)?)?(?:ft|feet|foot)\b", re.IGNORECASE)
-FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
 #: What programs write where they know nothing.
 _UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
-#: Names of columns of altitudes that others of a table give way to: heights may be those over the ground.
-_ALTITUDE = re.compile(r"alt(?!ura)|elli?p|ellh|elev|海拔", re.IGNORECASE)
-#: Units of columns: parts of metres, and angles.
-_PARTS = re.compile(r"[\[( _](mm|cm|km)\b", re.IGNORECASE)
-_ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
 #: DJI's list of moments (.MRK): one line for each photograph, by its number.
 _MRK = re.compile(r"([-\d.]+),Lat\s+([-\d.]+),Lon\s+([-\d.]+),Ellh")
-_ENDING = re.compile(r"\.[A-Za-z]{3,4}$")
 
 
 @dataclass(frozen=True)
@@ -120,12 +78,14 @@ class _Columns(NamedTuple):
     """The coordinate system that the table names."""
     altitude_unit: float = 1.0
     """Metres in one of its altitudes."""
-    assumed: bool = False
-    """The order is that of programs that write no header."""
+    note: str = ""
+    """How columns are read that do not say it themselves."""
     heights: tuple[str, ...] = ()
     """Names of the columns of altitudes: the one that is read, and those that are not."""
     deviation_units: Mapping[str, float] = MappingProxyType({})
     """Metres in one of each of its accuracies, NaN for angles."""
+    across_units: tuple[float, float] = (1.0, 1.0)
+    """Metres (of angles degrees) in one of x and of y where their names say another unit, as `[km]`; 1 elsewhere."""
 
 
 def read_gps_table(file: Path) -> GpsTable:
@@ -162,11 +122,12 @@ def read_gps_table(file: Path) -> GpsTable:
         for row, position in zip(placed, positions, strict=True)
     ]
     notes = list[str]()
-    if columns.assumed:
-        notes.append(f"{file.name} names no columns; read as name, latitude, longitude, altitude.")
+    notes += [f"{file.name} {columns.note}"] if columns.note else []
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
+    if columns.system is not None and (doubt := to_geodetic(columns.system, file)[1].partition("; ")[2]):
+        notes.append(f"{file.name}: {doubt}.")
     if len(placed) < len(rows):
         notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
     return GpsTable(tuple(found), notes=tuple(notes))
@@ -185,43 +146,38 @@ def _is_header(line: Line) -> bool:
     return {"name"} < set(known_columns(words))
 
 
-def known_columns(words: Sequence[str]) -> dict[str, int]:
-    """Which of these names of columns is what."""
-    found: dict[str, int] = {}
-    for k, word in enumerate(words):
-        letters = unicodedata.normalize("NFKD", word.lower())  # accents are signs of their own, brackets are narrow
-        plain = re.sub(r"[\W_]", "", _UNIT.sub("", letters))
-        what = next((what for what, names in _COLUMNS.items() if plain in names), None)
-        if what == "alt" and what in found and _ALTITUDE.search(word) and not _ALTITUDE.search(words[found[what]]):
-            found[what] = k
-        elif what is not None:
-            found.setdefault(what, k)
-    return found
-
-
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
     known = known_columns(rows[0].words)
-    unit = _meters(rows[0].words[known["alt"]]) if "alt" in known else 1.0
+    unit = meters_of(rows[0].words[known["alt"]]) if "alt" in known else 1.0
     others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
     heights = (rows[0].words[known["alt"]], *others) if others else ()
     named = {what: rows[0].words[known[what]] for what in _DEVIATIONS if what in known}
-    units = {what: math.nan if _ANGLES.search(word) else _meters(word) for what, word in named.items()}
+    units = {what: math.nan if ANGLES.search(word) else meters_of(word) for what, word in named.items()}
     if {"name", "lat", "lon"} <= set(known):
-        return _Columns(known, None, unit, heights=heights, deviation_units=units), rows[1:]
+        radians = all(RADIANS.search(rows[0].words[known[what]]) for what in ("lat", "lon"))
+        angle = math.degrees(1) if radians else 1.0
+        return _Columns(known, None, unit, heights=heights, deviation_units=units, across_units=(angle, angle)), rows[
+            1:
+        ]
     if {"lat", "lon"} <= set(known):
         raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
     if {"name", "x", "y"} <= set(known):
         if system is None and "system" in known and len(rows) > 1:
             code = rows[1].words[known["system"]]
             system = f"EPSG:{code}" if code.isdecimal() else code
+        if system is None and _are_degrees(rows[1:], known):
+            note = "does not say what x and y are; they look like longitude and latitude, and are taken as that."
+            places = {**known, "lon": known["x"], "lat": known["y"]}
+            return _Columns(places, None, unit, heights=heights, deviation_units=units, note=note), rows[1:]
         if system is None:
             raise CaptureError(
                 f"{file}: has the columns {rows[0].words[known['x']]!r} and {rows[0].words[known['y']]!r} but does not "
                 "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
                 "give name,lat,lon,alt."
             )
-        return _Columns(known, system, unit, heights=heights, deviation_units=units), rows[1:]
+        across = meters_of(rows[0].words[known["x"]]), meters_of(rows[0].words[known["y"]])
+        return _Columns(known, system, unit, heights=heights, deviation_units=units, across_units=across), rows[1:]
     if not _has_numbers(rows[0]):
         found = ", ".join(sorted(word for word in rows[0].words if word)) or "nothing"
         marks = "" if system is None else " A list of control points is given as --gcp."
@@ -233,7 +189,7 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         if len(rows[0].words) > 8:  # ODM: name x y z yaw pitch roll and two accuracies
             order |= {"across": 7, "upwards": 8}
         return _Columns({**order, "x": 1, "y": 2}, system), rows
-    values = [_plain_number(row.words[k]) for row in rows for k in (1, 2) if len(row.words) > k]
+    values = [number_of(row.words[k]) for row in rows for k in (1, 2) if len(row.words) > k]
     firsts, seconds = np.abs(np.array(values[::2], float)), np.abs(np.array(values[1::2], float))
     if max(firsts.max(initial=0), seconds.max(initial=0)) > 180:
         raise CaptureError(
@@ -242,26 +198,19 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         )
     swapped = firsts.max(initial=0) > 90
     places = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
-    return _Columns({**order, **places}, None, assumed=not swapped), rows
+    note = "" if swapped else "names no columns; read as name, latitude, longitude, altitude."
+    return _Columns({**order, **places}, None, note=note), rows
 
 
-def _meters(word: str) -> float:
-    """How many metres the unit has that a word names: feet, US survey feet, parts of metres, or metres."""
-    feet = _FEET.search(word)
-    if parts := _PARTS.search(word):
-        return {"mm": 1e-3, "cm": 1e-2, "km": 1e3}[parts[1].lower()]
-    return 1.0 if feet is None else SURVEY_FOOT_M if feet[1] else FOOT_M
+def _are_degrees(rows: Sequence[Row], known: Mapping[str, int]) -> bool:
+    """Whether x and y are longitudes and latitudes of one place: as metres they would be one and the same point."""
+    words = [[row.words[known[what]] if known[what] < len(row.words) else "" for what in ("x", "y")] for row in rows]
+    places = np.array([[number_of(word) for word in each] for each in words if "" not in each]).reshape(-1, 2)
+    return bool(np.isfinite(places).all() and (np.abs(places) < [180, 90]).all() and look_like_degrees(places))
 
 
 def _has_numbers(row: Row) -> bool:
-    return len(row.words) > 2 and all(math.isfinite(_plain_number(word)) for word in row.words[1:3])
-
-
-def _plain_number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return math.nan
+    return len(row.words) > 2 and all(math.isfinite(number_of(word)) for word in row.words[1:3])
 
 
 def _word(row: Row, columns: _Columns, what: str) -> str:
@@ -284,16 +233,32 @@ def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[
         if None in angles:
             words = [_word(row, columns, what) for what in ("lat", "lon", "alt")]
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
-        position = (angles[0] or 0.0, angles[1] or 0.0, _altitude(row, columns, file))
-        check_geodetic(position, file, f"line {row.number}: ")
+        latitude, longitude = ((angle or 0.0) * unit for angle, unit in zip(angles, columns.across_units, strict=True))
+        position = (latitude, longitude, _altitude(row, columns, file))
+        try:
+            check_geodetic(position, file, f"line {row.number}: ")
+        except CaptureError as error:
+            raise CaptureError(f"{error}{_other_degrees(latitude, longitude)}") from None
         found.append(position)
     return found
+
+
+def _other_degrees(latitude: float, longitude: float) -> str:
+    """A question about how numbers that are no degrees may be meant."""
+    if abs(latitude) > 1e6 and abs(latitude) <= 9e8 and abs(longitude) <= 1.8e9:
+        return " Are they degrees times 10,000,000, as in logs of autopilots? Divide them."
+    if 90 < abs(latitude) < 9000 and abs(longitude) < 18000 and max(abs(latitude) % 100, abs(longitude) % 100) < 60:
+        return " Are they degrees and minutes in one number (ddmm.mmmm, as in NMEA)? Write N or S, E or W behind them."
+    return ""
 
 
 def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str) -> float | None:
     word = _word(row, columns, what)
     try:
-        read: tuple[float, bool] | None = (float(word), False)
+        number, side_word = float(word), _word(row, columns, reference)[:1]
+        read: tuple[float, bool] | None = (number, False)
+        if abs(number) > LIMITS[axis] and side_word:
+            read = degrees_of_text(f"{word} {side_word}", axis) or read
     except ValueError:
         read = degrees_of_text(word, axis)
     if read is None:
@@ -307,7 +272,7 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     if word.lower() in _UNKNOWN:
         return math.nan
     number = _LEADING_NUMBER.match(word)
-    unit = _meters(word)
+    unit = meters_of(word)
     if number is None or (word[number.end() :].strip() and "sea" not in word.lower() and unit == 1):
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
     value = float(number[1].replace(",", ".")) * (unit if unit != 1 else columns.altitude_unit)
@@ -319,7 +284,7 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
     change, system = to_geodetic(columns.system or "", file)
     places = []
     for row in rows:
-        x, y = (_plain_number(_word(row, columns, what)) for what in ("x", "y"))
+        x, y = (number_of(_word(row, columns, what)) for what in ("x", "y"))
         if not (math.isfinite(x) and math.isfinite(y)):
             words = [_word(row, columns, what) for what in ("x", "y", "alt")]
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
@@ -327,6 +292,7 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
     if not places:
         return []
     given = np.array(places)
+    given[:, :2] *= [in_units_of(columns.system or "", unit, file) for unit in columns.across_units]
     known = np.isfinite(given[:, 2])
     changed = change(np.where(np.isfinite(given), given, 0.0))
     changed[~known, 2] = math.nan
@@ -341,7 +307,7 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
 
 def _deviations(row: Row, columns: _Columns) -> tuple[float, float] | None:
     across, upwards, *sides = (
-        _plain_number(_word(row, columns, what)) * columns.deviation_units.get(what, 1.0) for what in _DEVIATIONS
+        number_of(_word(row, columns, what)) * columns.deviation_units.get(what, 1.0) for what in _DEVIATIONS
     )
     if "across" not in columns.where:
         across = float(np.max(sides))  # NaN where one of them is not known
@@ -358,7 +324,7 @@ def _moments(lines: Sequence[Line], file: Path) -> GpsTable:
         words = text.split()
         position = (float(match[1]), float(match[2]), float(match[3]))
         check_geodetic(position, file, f"line {number}: ")
-        spread = [_plain_number(word) for word in re.split(r"[,\s]+", text[match.end() :].strip()) if word][:3]
+        spread = [number_of(word) for word in re.split(r"[,\s]+", text[match.end() :].strip()) if word][:3]
         known = len(spread) == 3 and all(0 < value < 100 for value in spread)
         deviations = (max(spread[:2]), spread[2]) if known else None
         rows.append(GpsRow(number, words[0], position, deviations))
@@ -373,16 +339,6 @@ def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
     finite = known & np.isfinite(altitudes)
     enough = finite.sum() >= min(3, known.sum()) and 2 * finite.sum() >= known.sum()
     return (finite, True) if enough else (known, False)
-
-
-def by_number(names: Sequence[str]) -> Callable[[str], tuple[tuple[int, int], list[int]]]:
-    """What finds photographs by the number that DJI gives them: the last group of four digits of their names."""
-    found: dict[int, list[int]] = {}
-    for index, name in enumerate(names):
-        digits = re.findall(r"(?<!\d)\d{4}(?!\d)", _ENDING.sub("", name.rpartition("/")[2]))
-        if digits:
-            found.setdefault(int(digits[-1]), []).append(index)
-    return lambda number: ((0, 0), found.get(int(number), []) if number.isdecimal() else [])
 
 
 def check_geodetic(position: tuple[float, ...], file: Path, where: str = "") -> None:

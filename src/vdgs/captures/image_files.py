@@ -56,6 +56,8 @@ ROUNDING_PX = 1.0
 MASK_THRESHOLD = 128
 #: What programs put behind a photograph's name for that of its mask.
 _MASK_TAILS = ("_mask", ".mask", "-mask", "_msk")
+#: How instant-ngp's masks begin, which are white where others are black: at what is left out.
+DYNAMIC_MASK = "dynamic_mask_"
 #: Pillow's modes that we know how to bring to 8-bit RGB.
 SUPPORTED_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L", "CMYK"}
 #: What may say, before the pixels, that colors are of another space than sRGB: profiles, CMYK, EXIF's Adobe RGB.
@@ -188,7 +190,7 @@ def find_mask_beside(folder: Path, name: str, image: Path | None = None) -> Path
     none, as it would be of a name without extension."""
     path = Path(name)
     stems = [str(path.with_name(path.stem + tail)) for tail in _MASK_TAILS]
-    candidates = [name + ".png", name + ".mask.png"]
+    candidates = [name + ".png", name + ".mask.png", str(path.with_name(f"{DYNAMIC_MASK}{path.stem}.png"))]
     candidates += [stem + suffix for stem in stems for suffix in (".png", path.suffix)]
     return next(
         (found for found in (find_file(folder, each) for each in candidates) if found not in (None, image)), None
@@ -224,10 +226,16 @@ def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
     """What a mask keeps (white), [height, width] bool; a mask of another size is resampled to the image's."""
-    keep = _kept(_lightness(path))
+    keep = _mask(path)
     if keep.shape == (height, width):
         return keep
     return cv2.resize(keep.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _mask(path: Path) -> np.ndarray:
+    """What a mask keeps at its own size, [h, w] bool: of instant-ngp's what is black, of others what is bright."""
+    light = _lightness(path)
+    return light == 0 if path.name.startswith(DYNAMIC_MASK) else _kept(light)
 
 
 def _lightness(mask: Path) -> np.ndarray:
@@ -347,9 +355,9 @@ def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool)
     opaque = decode_image(photograph)[1] if may_be_transparent else None
     keep = opaque
     if mask is not None:
-        light = _lightness(mask)
-        kept = _kept(light)
+        kept = _mask(mask)
         if not kept.any():
+            light = _lightness(mask)
             hint = "Scale its values to 0 and 255" if light.any() else "Turn it round if it is inverted"
             raise CaptureError(
                 f"{mask}: leaves nothing of its photograph. White is kept, and the brightest value here is "

@@ -81,6 +81,8 @@ class AccuracyFacts:
     altitude: str = "used"
     """Recorded altitudes: `used`, `drifts` (with time, left out), `unused`, or `none` where there are none."""
     altitude_drift_m: float = 0.0
+    altitude_offsets_m: tuple[float, ...] = ()
+    """By how much altitudes of some flights lie over those of another by their datum, left out."""
 
     @property
     def summary(self) -> str:
@@ -232,6 +234,9 @@ def _accuracy_rows(accuracy: AccuracyFacts) -> list[tuple[str, str]]:
             "drifts": f"; altitudes drift by {accuracy.altitude_drift_m:+.0f} m, left out",
             "unused": "; altitudes are of no use, left out",
         }.get(accuracy.altitude, "")
+        if accuracy.altitude_offsets_m:
+            over = ", ".join(f"{off:+.0f} m" for off in accuracy.altitude_offsets_m)
+            words = f"; altitudes of flights differ by {over}, left out{words}"
         found = f"{by_axis(accuracy.positions_m, number='{:.2g}')} (one standard deviation, by the flight itself)"
         rows.append(("Positions are good to", f"{found}{words}"))
     return rows

@@ -30,7 +30,7 @@ _OF_MAPS = {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "pre
 #: Pictures of ours, and what screens leave on a disk.
 _PICTURES = re.compile(
     r"(photographs|reconstruction|contact[_ -]?sheet)\.(png|jpe?g)|screen[ _-]?shots?\b.*|bildschirmfoto.*"
-    r"|capture d.écran.*|dynamic_mask_.+\.png"  # the latter instant-ngp's: white is what moves, not what to keep
+    r"|capture d.écran.*"
     r"|(odm_)?(orthophoto|orthomosaic|ortho|dsm|dtm|dem|hillshade|mosaic)([_-].*)?\.(tiff?|png|jpe?g)"
     r"|.+[_-](orthophoto|orthomosaic|transparent_mosaic[_-]?\w*|mosaic_\w+|dsm|dtm|ortho)\.(tiff?|png|jpe?g)",
     re.IGNORECASE,
@@ -38,7 +38,7 @@ _PICTURES = re.compile(
 #: What folders of masks are called, the usual name first.
 MASK_FOLDERS = ("masks", "mask", "_masks", "images_masks", "image_masks", "Masks")
 _MASK_FOLDER = re.compile(r"_?(images?_?)?(masks?|msk)(_?images?)?|.+_masks", re.IGNORECASE)
-_MASK_STEM = re.compile(r"(?P<before>.+?)[ ._-](mask|msk)|(mask|msk)[ ._-](?P<after>.+)", re.IGNORECASE)
+_MASK_STEM = re.compile(r"(?P<before>.+?)[ ._-](mask|msk)|(dynamic_)?(mask|msk)[ ._-](?P<after>.+)", re.IGNORECASE)
 _PREVIEW_STEM = re.compile(
     r"(?P<before>.+?)[ ._-](thumb|thumbnail|preview|small|proxy|tn)|(thumb|tn)[ ._-](?P<after>.+)", re.I
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -227,11 +228,8 @@ def _spelled(name: str) -> str:
 
 
 def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    """Whether a word is a negative number, such as -5, -.5 and -1,5."""
+    return re.match(r"-\.?\d|-(inf|nan)", word, re.IGNORECASE) is not None
 
 
 #: What other programs call options of ours; the first that a verb has is meant.

@@ -22,6 +22,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any
 
+from vdgs.config.number_words import how_to_write, plain_number
 from vdgs.config.ranges import FlagName, Positional, Repeatable, to_flag
 from vdgs.config.serialization import describe_type, field_hints, without_notes
 
@@ -95,11 +96,15 @@ class Option:
 
     def read(self, words: Sequence[str]) -> Any:
         """The value that words say. Raises ValueError, in words that follow the name, for others."""
+        count = self.num_words or 0
+        if len(words) == 1 and count > 2 and words[0].count(",") == count - 1:  # as GIS programs write boxes
+            words = words[0].split(",")
         try:
-            return read_words(self.hint, words)
+            return read_words(self.hint, [plain_number(word, self.flag, self.hint) for word in words])
         except ValueError:
             said, kind = " ".join(words).strip(), describe_type(self.hint).removesuffix(" or null")
-            raise ValueError(f"{said}: must be {kind}" if said else f"needs a value: {kind}") from None
+            how = how_to_write(said, self.flag, self.hint)
+            raise ValueError(f"{said}: must be {kind}{how}" if said else f"needs a value: {kind}") from None
 
 
 def off_flag(flag: str) -> str:

@@ -112,6 +112,10 @@ def _read(hint: Any, value: Any, where: str) -> Any:
     if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4
         with suppress(ValueError):
             return float(value)
+    if kind is int and isinstance(value, (str, float)):  # and 1e3, too
+        with suppress(ValueError, OverflowError):
+            if (number := float(value)).is_integer():
+                return int(number)
     plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
     if plain and (kind is bool or not isinstance(value, bool)):
         return value

@@ -139,7 +139,10 @@ def _write_video(job: _Render, fps: float) -> str:
         raise VdgsError(f"{output}: is a folder. Give another name for the film.")
     sizes = {(camera.width, camera.height) for _, camera in job.named}
     if len(sizes) > 1:
-        raise VdgsError(f"{output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder.")
+        raise VdgsError(
+            f"{output}: a film needs frames of one size, and these views have {len(sizes)}, of several cameras. Give a "
+            "folder, or a camera path (--path FILE.json)."
+        )
     if (said := caution(default_encoder())) is not None:
         job.console.print(f"[yellow]note[/] {said}", highlight=False)
     with VideoWriter(output, fps) as video:

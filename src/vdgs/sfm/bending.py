@@ -38,13 +38,14 @@ def bend_to_positions(
     bent = pycolmap.Reconstruction(model)
     images = {image.name: image for image in bent.images.values() if image.has_pose}
     priors: list[pycolmap.PosePrior] = []
-    for row in placed.position_rows[placed.inliers].tolist():
+    used = placed.targets[placed.inliers]
+    for row, target in zip(placed.position_rows[placed.inliers].tolist(), used, strict=True):
         image = images[photographs[int(positions.image_indices[row])].name]
         priors.append(
             pycolmap.PosePrior(
                 pose_prior_id=len(priors) + 1,
                 corr_data_id=image.data_id,
-                position=positions.enu[row],
+                position=target,
                 position_covariance=np.diag(deviations**2),
                 coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
             )

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs.captures.image_files import open_image, same_aspect
+from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import Lens, unzoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
@@ -31,6 +32,12 @@ BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
 _DJI_NAME = re.compile(
     r"(?:(?P<before>.*?)(?P<time>\d{14})|)(?P<number>.*?)_(?P<camera>[TSVWZ])(?P<after>_.*)?", re.IGNORECASE
 )
+#: How systems and programs name what they copy, edit or download again.
+_COPY_NAME = re.compile(
+    r"(.+?)(?:[ _]?\(\d{1,2}\)|[ _-]+(?:copy|copie|kopie|copia)(?:[ _]?\(?\d{1,2}\)?)?"
+    r"|[-_~](?:edited|edit|bearbeitet|\d))",
+    re.IGNORECASE,
+)
 _SAME_MOMENT = timedelta(seconds=2)
 #: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
 _PREFERRED = ("panchro", "green", "red", "blue")
@@ -45,7 +52,11 @@ def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
     groups: dict[str, list[ImageMetadata]] = {}
     for photo in photographs:
         groups.setdefault(photo.camera, []).append(photo)
-    changed = {photo.name: photo for group in groups.values() for photo in _without_defaults(_zoom_once(group))}
+    changed = {
+        photo.name: photo
+        for group in groups.values()
+        for photo in _without_defaults(_one_altitude(_cropped(_zoom_once(group))))
+    }
     return [changed[photo.name] for photo in photographs]
 
 
@@ -77,8 +88,51 @@ def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
     return replace(photo, lens=replace(lens, doubt=doubt), doubts=(*photo.doubts, doubt))
 
 
+def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
+    """Photographs that share one side with most of their camera and lack some of the longer one were cut by a program,
+    which leaves the focal length in pixels as it was."""
+    known = [photo for photo in group if photo.lens is not None]
+    if not known:
+        return group
+    usual = Counter((photo.size, photo.lens) for photo in known).most_common(1)[0][0]
+    (size, usual_lens), found = usual, []
+    for photo in group:
+        lens, (short, longer) = photo.lens, sorted(photo.size)
+        cut = usual_lens is not None and min(size) == short and longer < max(size)
+        if cut and lens and usual_lens and (lens.focal_mm, lens.source) == (usual_lens.focal_mm, usual_lens.source):
+            doubt = "cut to another shape than most of its camera; the focal length in pixels is taken as theirs"
+            focal = usual_lens.focal * max(size) / longer
+            photo = replace(photo, lens=replace(lens, focal=focal), doubts=(*photo.doubts, doubt))
+        found.append(photo)
+    return found
+
+
 def _near(one: float, other: float) -> bool:
     return abs(one / other - 1) < ONE_FOCAL
+
+
+def _one_altitude(group: list[ImageMetadata]) -> list[ImageMetadata]:
+    """Altitudes of a flight all from EXIF or all from XMP, as most of its photographs have it in which these differ: in
+    a single one tags agree by chance. An altitude of 0 among EXIF's is a default: XMP's is taken, by as much off as the
+    others."""
+    flights = flights_of(group)
+    found = list(group)
+    for number in np.unique(flights):
+        members = [k for k in np.flatnonzero(flights == number).tolist() if group[k].altitudes is not None]
+        pairs = [group[k].altitudes or ((None, ""), (None, "")) for k in members]
+        by_xmp = [group[k].altitude == in_xmp[0] for k, (_, in_xmp) in zip(members, pairs, strict=True)]
+        if not 0 < sum(by_xmp) < len(by_xmp):
+            continue
+        most = 2 * sum(by_xmp) >= len(by_xmp)
+        kind = Counter(group[k].altitude_type for k, each in zip(members, by_xmp, strict=True) if each == most)
+        apart = [a[0] - b[0] for (a, b), each in zip(pairs, by_xmp, strict=True) if not each and a[0] and b[0]]
+        for k, (in_exif, in_xmp), each in zip(members, pairs, by_xmp, strict=True):
+            if each != most:
+                altitude = (in_exif, in_xmp)[most][0]
+                if not altitude and in_xmp[0] is not None:
+                    altitude = in_xmp[0] + float(np.median(apart))
+                found[k] = replace(group[k], altitude=altitude, altitude_type=kind.most_common(1)[0][0])
+    return found
 
 
 def _without_defaults(group: list[ImageMetadata]) -> list[ImageMetadata]:
@@ -100,7 +154,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
 
     A picture without any tags is a stray only where most others have them.
     """
-    reasons = _smaller_copies(photographs) | _other_cameras(photographs)
+    reasons = _smaller_copies(photographs) | _other_cameras(photographs) | _later_copies(photographs)
     tagged = [photo for photo in photographs if not is_bare(photo)]
     bare = [photo for photo in photographs if is_bare(photo) and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()
@@ -167,6 +221,18 @@ def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
             if small and same_aspect(photo.size, largest.size):
                 reasons[photo.name] = f"is a smaller copy of {largest.name}"
     return reasons
+
+
+def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Photographs that were downloaded twice or edited, beside the first: of its moment and place, named after it."""
+    names = {PurePosixPath(photo.name).with_suffix("").as_posix().lower(): photo for photo in photographs}
+    found = {}
+    for photo in photographs:
+        match = _COPY_NAME.fullmatch(PurePosixPath(photo.name).with_suffix("").as_posix())
+        first = names.get(match[1].lower()) if match else None
+        if first is not None and photo.datetime and (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon):
+            found[photo.name] = f"is a copy or another version of {first.name}, by its name, moment and place"
+    return found
 
 
 def is_black_and_white(photo: ImageMetadata) -> bool:

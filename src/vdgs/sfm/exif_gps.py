@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from vdgs.captures.angles import LIMITS, SIDES, degrees_of_parts, degrees_of_text, side_of
-from vdgs.captures.gps_tables import FOOT_M
+from vdgs.captures.table_columns import FOOT_M
 from vdgs.sfm.xmp import first_number, text
 
 #: Places in EXIF and XMP that are farther apart than this (degrees, some 100 m) contradict each other.
@@ -28,7 +29,16 @@ _XMP = {
     "longitude": ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude"),
 }  # fmt: skip
 
+#: Datums that agree with WGS 84 to a metre or two.
+_GLOBAL_DATUMS = re.compile(
+    r"WGS[-_ ]*(19)?84|ITRF|ETRS|JGD|CGCS|GDA|NAD[-_ ]*(19)?83|SIRGAS|PZ[-_ ]*90|GRS[-_ ]*(19)?80|KGD|NZGD", re.I
+)
+#: Altitudes that differ by less (metres) are the same number.
+SAME_M = 0.01
+
 Place = tuple[float, float]
+#: Metres, None where they are not known, and what they are measured from.
+Altitude = tuple[float | None, str]
 
 
 def finite(value: Any) -> float | None:
@@ -82,8 +92,25 @@ def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | 
     return place, ""
 
 
-def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float | None, str]:
+def other_datum(gps: Mapping[int, Any]) -> str:
+    """What people should know of positions that EXIF says to be of a datum that is not within a metre or two of WGS 84;
+    empty elsewhere."""
+    datum = plain_text(gps.get(0x12))
+    if not datum or gps.get(2) is None or _GLOBAL_DATUMS.search(datum):
+        return ""
+    return (
+        f"EXIF says that positions are of the datum {datum}: taken as of WGS 84, from which it may differ by some "
+        "hundred metres (a table of positions, --gps, whose first line names the system, mends it)"
+    )
+
+
+def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> Altitude:
     """Altitude in metres and what it is measured from, as far as the file says."""
+    return read_altitudes(gps, xmp)[0]
+
+
+def read_altitudes(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Altitude, tuple[Altitude, Altitude] | None]:
+    """The altitude that is taken, and EXIF's and XMP's where these differ by a metre."""
     reference = gps.get(5)
     reference = reference[0] if isinstance(reference, bytes) and len(reference) == 1 else reference
     value = finite(gps.get(6))
@@ -92,22 +119,31 @@ def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[float
     elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
         value = -abs(value)
     absolute = first_number(xmp, "AbsoluteAltitude")
+    if value is None or not absolute:
+        return _measured(value, absolute, xmp, ""), None
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
-    source, named = "EXIF GPSAltitude", text(xmp, "AltitudeType", "Camera:VertCS")
-    confirmed = bool(value is not None and ellipsoidal and abs(ellipsoidal - value) < 0.01)
-    if value is not None and absolute and not confirmed and _is_absolute_otherwise(value, absolute, xmp):
-        if abs(abs(value) - abs(absolute)) >= 1:
-            source, named = "AbsoluteAltitude in XMP", f"AbsoluteAltitude in XMP ({named})" if named else ""
-        value = absolute
+    confirmed = bool(ellipsoidal and abs(ellipsoidal - value) < SAME_M)
+    by_xmp = not confirmed and _is_absolute_otherwise(value, absolute, xmp)
+    named = "AbsoluteAltitude in XMP" if abs(abs(value) - abs(absolute)) >= 1 else ""
+    both = _measured(value, absolute, xmp, ""), _measured(absolute, absolute, xmp, named)
+    taken = both[by_xmp] if both[by_xmp][0] is not None else both[not by_xmp]
+    return taken, both if abs(value - absolute) >= 1 else None
+
+
+def _measured(value: float | None, absolute: float | None, xmp: Mapping[str, str], source: str) -> Altitude:
+    """An altitude with what it is measured from; `source` where that is not EXIF."""
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
     if value < LOWEST_M:
         return -value, "EXIF GPSAltitude, whose mark 'below sea level' cannot be true"
-    if ellipsoidal is not None and abs(ellipsoidal - value) < 0.01:
+    ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, "AltitudeType", "Camera:VertCS")
+    if ellipsoidal is not None and abs(ellipsoidal - value) < SAME_M:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
     if absolute and abs(value - absolute) > MOST_APART_M:
         return value, "EXIF GPSAltitude as recorded, which differs from AbsoluteAltitude in XMP by more than 30 m"
-    return value, f"{named} as recorded" if named else f"{source} as recorded, datum not stated"
+    if named and source:
+        named = f"{source} ({named})"
+    return value, f"{named} as recorded" if named else f"{source or 'EXIF GPSAltitude'} as recorded, datum not stated"
 
 
 def _is_absolute_otherwise(value: float, absolute: float, xmp: Mapping[str, str]) -> bool:

@@ -25,6 +25,9 @@ MARK_SIGMA_PX = 2.0
 #: A mark so many pixels from where the model puts a surveyed point is wrong; points whose marks are farther off than
 #: this share of a photograph's longer side are not used (choice).
 MARK_WRONG_PX, MARK_USELESS = 8.0, 0.01
+#: Points are on the surface: seen so many times as far as what lies nearest to their marks, or as near, they are none
+#: of the places that were marked (choice); of so many features.
+DEPTHS_APART, NEAREST = 1.3, 10
 ANYWAY_GCP = (
     "Mend the list, place by GPS and only measure the points (--check-points all), or use it as it is "
     "(--georeference anyway)."
@@ -160,6 +163,12 @@ def adjust_to_gcps(
     if marked:
         raise CaptureError(f"{gcps.source}: its marks fit the photographs only if {marked}. {ANYWAY_GCP}")
     used = [(k, seen) for k, seen in used if k not in wrong]
+    depth = _depth_beside_surface(model, gcps, used)
+    if doubts is not None and not 1 / DEPTHS_APART < depth < DEPTHS_APART:
+        raise CaptureError(
+            f"{gcps.source}: its marks meet {depth:.2g} times as far from the cameras as what the photographs show "
+            f"there. Are they pixels of photographs of another size, or of other points? {ANYWAY_GCP}"
+        )
     rows = np.array([k for k, _ in used], int)
     if len(used) < MIN_CONTROL_POINTS or is_collinear(targets[rows]):
         bad = f", {len(wrong)} more are marked where they cannot be" if wrong else ""
@@ -179,6 +188,26 @@ def adjust_to_gcps(
     model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in kept], fix_focal, threads)
     doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
     return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
+
+
+def _depth_beside_surface(
+    model: pycolmap.Reconstruction, gcps: GcpList, used: Sequence[tuple[int, TriangulatedPoint]]
+) -> float:
+    """How many times as far from the cameras points are as what is seen nearest to their marks, the median: marks of
+    photographs of another size meet too, elsewhere. 1 where the photographs show too little there."""
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    ratios = []
+    for _, seen in used:
+        for each in seen.agreeing:
+            view = images[each.image]
+            shown = [point for point in view.points2D if point.has_point3D()]
+            if len(shown) < NEAREST:
+                continue
+            near = np.argsort(np.linalg.norm([point.xy - each.pixel for point in shown], axis=1))[:NEAREST]
+            ahead = view.cam_from_world().matrix()[2]
+            depths = [ahead @ np.append(model.points3D[shown[k].point3D_id].xyz, 1) for k in near]
+            ratios.append(float(ahead @ np.append(seen.position, 1) / np.median(depths)))
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def _useless_px(model: pycolmap.Reconstruction) -> float:

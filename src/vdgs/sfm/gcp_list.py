@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.coordinate_systems import to_geodetic
-from vdgs.captures.gps_tables import known_columns
+from vdgs.captures.coordinate_systems import in_units_of, to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
+from vdgs.captures.table_columns import known_columns, meters_of, number_of
 from vdgs.captures.text_tables import Line, Row, rows_of, separator_of
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
@@ -28,6 +28,8 @@ MIN_CONTROL_POINTS = 3
 MAX_DISTANCE_M = 20_000.0
 #: A word for all points of the file, where some are named to be held out.
 ALL_POINTS = "all"
+#: How the names of check points begin in ODM.
+CHECK_PREFIX = "CHK-"
 #: Points higher above or below the sea are none (metres).
 _MAX_HEIGHT_M = 20_000.0
 
@@ -96,9 +98,10 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
-    header, rows = _rows(file)
+    header, rows, (across, along, up) = _rows(file)
     transform, system = to_geodetic(header, file)
-    lines = [_line(row, file) for row in rows]
+    units = in_units_of(header, across, file), in_units_of(header, along, file), up
+    lines = [_line(row, file, units) for row in rows]
     by_name = photographs_by_name(collection)
     lines, strange = _of_photographs(lines, by_name, file)
     found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
@@ -111,7 +114,10 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     for name, group in zip(names, groups.values(), strict=True):
         geodetic = _geodetic([line for line, _ in group], name, transform, system, file)
         seen = tuple(sighting for _, sighting in group if sighting is not None)
-        points.append(GroundControlPoint(name, geodetic, seen, ALL_POINTS in check_points or name in check_points))
+        held_out = ALL_POINTS in check_points or name in check_points or name.startswith(CHECK_PREFIX)
+        points.append(GroundControlPoint(name, geodetic, seen, held_out))
+    if any(name.startswith(CHECK_PREFIX) for name in names):
+        strange = [*strange, f"{file.name}: points named {CHECK_PREFIX}... are held out as check points, as in ODM."]
     return _checked(points, system, file, strange)
 
 
@@ -166,8 +172,9 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
         )
 
 
-def _rows(file: Path) -> tuple[str, list[Row]]:
-    """The first line, and the words of the others, without names of columns: parted by blanks, or as in a CSV table."""
+def _rows(file: Path) -> tuple[str, list[Row], tuple[float, ...]]:
+    """The first line, and the words of the others, parted by blanks, or as in a CSV table; without names of columns, of
+    which the metres in one of x, y and z are given."""
     lines = [Line(*line) for line in text_lines(file, "control points")]
     if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
@@ -176,9 +183,9 @@ def _rows(file: Path) -> tuple[str, list[Row]]:
     if separator_of([line.text for line in lines]):
         rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
     if not rows or any(map(_is_number, rows[0].words[:5])):
-        return header.text, rows
+        return header.text, rows, (1.0, 1.0, 1.0)
     _check_order(rows[0], file)
-    return header.text, rows[1:]
+    return header.text, rows[1:], tuple(map(meters_of, (rows[0].words + 3 * [""])[:3]))
 
 
 def _check_order(names: Row, file: Path) -> None:
@@ -199,10 +206,16 @@ def _is_number(word: str) -> bool:
         return False
 
 
-def _line(row: Row, file: Path) -> _Line:
+def _number(word: str) -> float:
+    """A number, also with signs between thousands. ValueError for anything else."""
+    found = number_of(word)
+    return float(word) if math.isnan(found) else found
+
+
+def _line(row: Row, file: Path, units: tuple[float, ...]) -> _Line:
     number, words = row
     try:
-        x, y, z, across, down = (float(word) for word in words[:5])
+        x, y, z, across, down = map(_number, words[:5])
         photograph = words[5].strip()
     except (ValueError, IndexError):
         alone = " Surveyed points alone do not say where photographs show them." if len(words) < 6 else ""
@@ -213,7 +226,8 @@ def _line(row: Row, file: Path) -> _Line:
     if not all(map(math.isfinite, (x, y, z, across, down))):
         raise CaptureError(f"{file}: line {number}: numbers must be finite. Mend the line.")
     name = words[6].strip() if len(words) > 6 else ""
-    return _Line(number, (x, y, z), (across, down), photograph, name)
+    place = x * units[0], y * units[1], z * units[2]
+    return _Line(number, place, (across, down), photograph, name)
 
 
 def photographs_by_name(collection: ImageList) -> NameLookup[ImageMetadata | str]:

@@ -128,6 +128,7 @@ def _by_distance(
         similarity=Similarity(factor, rotation, -factor * middle),
         method=how,
         position_rows=np.zeros(0, int),
+        targets=none,
         residuals=none,
         inliers=np.zeros(0, bool),
         accuracy=accuracy,
@@ -165,7 +166,8 @@ def _bent(
     if bent is model:
         return model, placed
     lies = georegistration.registration_in_place(bent, photographs, positions, placed.method)
-    return bent, replace(placed, residuals=lies.residuals)
+    off = lies.targets - placed.targets
+    return bent, replace(placed, residuals=lies.residuals + off[:, : lies.residuals.shape[1]])
 
 
 def _by_control(

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.position_fit import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
+from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -52,6 +53,8 @@ class Georegistration:
     method: str
     position_rows: np.ndarray
     """Which positions have a placed photograph, [m] rows of `GpsPriors`."""
+    targets: np.ndarray
+    """Those positions as they are used [m, 3], where altitudes are corrected."""
     residuals: np.ndarray
     """Of them, placed minus recorded, metres [m, 3]; [m, 2] where no altitudes are recorded."""
     inliers: np.ndarray
@@ -110,26 +113,36 @@ def georegister(
             "be its own mirror image, or upside down. Are latitude and longitude exchanged, or is a hemisphere (S, W, "
             f"a minus sign) missing? {ANYWAY}"
         )
-    fit, barometer = _best_fit(problem, taken)
+    levelled, offsets = _without_offsets(problem, positions, rows)
+    fit, barometer = _best_fit(levelled, taken)
+    if offsets is not None:
+        fit = replace(fit, place_error_m=_with_datum(fit, offsets, positions.gps_std[rows, 2]))
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
     notes += [f"{refused}; used all the same, as asked for."] if refused else []
     notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
-    line = " along one line" if is_nearly_collinear(targets, positions.gps_std[rows]) else ""
-    how = f"positions of {int(fit.inliers.sum())} photographs{line} ({positions.source})"
-    how += f"; up by {up.how}" if line or fit.altitude != "used" else ""
-    how += "; heights by the barometer" if barometer else ""
+    how = _method(fit, barometer, is_nearly_collinear(targets, positions.gps_std[rows]), positions.source, up.how)
+    notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += _of_altitudes(fit, barometer) + _of_north(fit.similarity, images, taken)
     return Georegistration(
         similarity=fit.similarity,
         method=how,
         position_rows=rows,
-        residuals=_recorded(fit.placed - targets, positions),
+        targets=fit.placed - fit.residuals,
+        residuals=_recorded(fit.placed - levelled.targets, positions),
         inliers=fit.inliers,
-        accuracy=accuracy_of(fit, targets, positions),
+        accuracy=accuracy_of(fit, targets, positions, offsets),
         notes=tuple(notes),
     )
+
+
+def _method(fit: PositionFit, barometer: bool, on_a_line: bool, source: str, up: str) -> str:
+    """How a model was placed, in words."""
+    line = " along one line" if on_a_line else ""
+    how = f"positions of {int(fit.inliers.sum())} photographs{line} ({source})"
+    how += f"; up by {up}" if line or fit.altitude != "used" else ""
+    return how + ("; heights by the barometer" if barometer else "")
 
 
 def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
@@ -137,7 +150,9 @@ def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
     return values if positions.has_altitudes else values[..., :2]
 
 
-def accuracy_of(fit: PositionFit, targets: np.ndarray, positions: GpsPriors) -> AccuracyFacts:
+def accuracy_of(
+    fit: PositionFit, targets: np.ndarray, positions: GpsPriors, offsets: AltitudeOffsets | None = None
+) -> AccuracyFacts:
     """The accuracy of a fit, for people."""
     place = fit.place_error_m if positions.has_altitudes else fit.place_error_m[:1]
     away = np.linalg.norm(targets[:, :2] - targets[:, :2].mean(axis=0), axis=1)
@@ -146,7 +161,44 @@ def accuracy_of(fit: PositionFit, targets: np.ndarray, positions: GpsPriors) -> 
         north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
         positions_m=tuple(_recorded(fit.gps_std, positions).tolist()),
         altitude=fit.altitude if positions.has_altitudes else "none", altitude_drift_m=fit.drift_m,
+        altitude_offsets_m=tuple(offsets.different) if offsets is not None else (),
     )  # fmt: skip
+
+
+def _without_offsets(
+    problem: Problem, positions: GpsPriors, rows: np.ndarray
+) -> tuple[Problem, AltitudeOffsets | None]:
+    """The problem with all altitudes from one datum, and what was left out, where flights differ and one datum explains
+    the photographs better. Places in the plane alone tell it."""
+    if not problem.has_altitudes or len(positions.flights) != len(positions) or not np.ptp(positions.flights[rows]):
+        return problem, None
+    plane = fit_positions(replace(problem, has_altitudes=False))
+    flights, up = positions.flights[rows], positions.gps_std[rows, 2]
+    offsets = altitude_offsets(plane.placed, problem.targets, flights, problem.up.deviation_deg, up)
+    if offsets is None:
+        return problem, None
+    levelled = replace(problem, targets=problem.targets - offsets.by_position[:, None] * [0, 0, 1])
+    costs = DRIFT_COSTS * len(offsets.different) * (1 if problem.stated is None else STATED_TIMES)
+    better = fit_positions(levelled).score + costs < fit_positions(problem).score
+    return (levelled, offsets) if better else (problem, None)
+
+
+def _with_datum(fit: PositionFit, offsets: AltitudeOffsets, up_std: np.ndarray) -> tuple[float, float]:
+    """Place across and up: nothing says whose datum is right, unless one flight alone states the accuracy of RTK."""
+    across, up = fit.place_error_m
+    here, others = (np.median(up_std[which]) for which in (offsets.reference, ~offsets.reference))
+    if here <= FIXED_M < others:
+        return across, up
+    return across, float(np.hypot(up, np.abs(offsets.different).max()))
+
+
+def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
+    over = [f"{off:+.0f} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different]
+    return [
+        f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?): {', '.join(over)} over "
+        f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the "
+        f"latter, good to ±{fit.place_error_m[1]:.0f} m. A table of positions (--gps) with one datum mends it."
+    ]
 
 
 def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[PositionFit, bool]:
@@ -269,6 +321,7 @@ def registration_in_place(
         similarity=stays,
         method=method,
         position_rows=rows,
+        targets=targets,
         residuals=_recorded(centers - targets, positions),
         inliers=np.ones(len(rows), bool),
         accuracy=accuracy,

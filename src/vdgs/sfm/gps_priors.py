@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_tables import GpsRow, read_gps_table, with_altitudes
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
+from vdgs.sfm.flights import flights_of
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
 
@@ -51,6 +52,8 @@ class GpsPriors:
     """What people should know: positions left out, and why."""
     has_altitudes: bool = True
     """False where most positions have none: then heights here are 0, and positions count in the plane alone."""
+    flights: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """Numbers [m] of the flights of the positions, whose altitudes may differ by a datum; empty where none is told."""
 
     def __len__(self) -> int:
         return len(self.image_indices)
@@ -105,9 +108,10 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     origin = _origin(geodetic[index])
     enu = enu_from_geodetic(geodetic[index], origin) if len(index) else np.zeros((0, 3))
     if len(index) >= MIN_POSITIONS and np.ptp(enu[:, :2], axis=0).max() < MIN_SPREAD_M:
+        radians = table is not None and (np.abs(geodetic[index, :2]) < [np.pi / 2, np.pi]).all()
         notes.append(
             f"all {len(index)} positions are within {MIN_SPREAD_M:g} m of each other: they tell neither scale nor "
-            "north; not used."
+            f"north; not used.{' Are they in radians? Write degrees.' if radians else ''}"
         )
         index, enu = index[:0], enu[:0]
     deviations = np.array(
@@ -118,6 +122,9 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         kinds = list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
+    flights = flights_of(
+        [photographs[i] for i in index.tolist()], [recorded.kinds[i] for i in index.tolist()], enu[:, 2]
+    )
     return GpsPriors(
         image_indices=index,
         enu=enu,
@@ -127,6 +134,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         source=recorded.source,
         notes=tuple(notes),
         has_altitudes=has_altitudes,
+        flights=flights,
     )
 
 

@@ -25,6 +25,7 @@ from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photogr
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.rig_folders import with_sensors
+from vdgs.sfm.sidecars import with_sidecars
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 
@@ -175,7 +176,7 @@ def _of_the_flight(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMeta
 
 def _read(path: Path, name: str, mask: Path | None) -> ImageMetadata | ExcludedImage:
     try:
-        photo = replace(read_image_metadata(path, name), mask=mask)
+        photo = with_sidecars(replace(read_image_metadata(path, name), mask=mask))
     except UnusableImage as why:
         return ExcludedImage(name, str(why))
     check_mask(photo)

@@ -15,7 +15,7 @@ from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES
 from vdgs.captures.image_tags import ImageTags, read_tags
 from vdgs.captures.jpeg import lacks_only_end
 from vdgs.errors import CaptureError
-from vdgs.sfm.exif_gps import finite, plain_text, read_altitude, read_place
+from vdgs.sfm.exif_gps import Altitude, finite, other_datum, plain_text, read_altitudes, read_place
 from vdgs.sfm.focal_length import Lens, read_lens
 from vdgs.sfm.spectral_bands import band_of
 from vdgs.sfm.xmp import first_number, read_xmp, text
@@ -176,6 +176,8 @@ class ImageMetadata:
     """Of such a view, width and height of the upright panorama."""
     sensor: str = ""
     """The folder of its camera in a rig (`rig1/cam0/`); empty for cameras on their own."""
+    altitudes: tuple[Altitude, Altitude] | None = None
+    """EXIF's and XMP's, where these differ."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 
@@ -234,7 +236,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     if orientation in TRANSPOSED_ORIENTATIONS:
         width, height = height, width
     place, unclear = read_place(gps, xmp)
-    altitude, altitude_type = read_altitude(gps, xmp)
+    (altitude, altitude_type), both = read_altitudes(gps, xmp)
     attitude, default = read_attitude(xmp)
     return ImageMetadata(
         name=name,
@@ -248,13 +250,14 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         lat_lon=place,
         altitude=altitude,
         altitude_type=altitude_type,
+        altitudes=both,
         gps_std=_stated_std(xmp),
         gps_error_m=_gps_error(gps),
         relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
         attitude=attitude if orientation == 1 else None,
         file_bytes=size,
         has_alpha_channel=found.has_alpha_channel,
-        doubts=tuple(filter(None, (unclear, default, lens.doubt if lens else ""))),
+        doubts=tuple(filter(None, (unclear, other_datum(gps), default, lens.doubt if lens else ""))),
         whole=found.whole,
         kind=found.kind,
         band=band_of(name, found.mode, xmp),

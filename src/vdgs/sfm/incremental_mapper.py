@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
+from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE
 from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import GpsPriors
@@ -25,6 +27,10 @@ from vdgs.system.lazy_pycolmap import pycolmap
 
 #: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
+#: Why a focal length is held until the model shows whether it can be fitted: `release_focal`.
+OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
+#: Between these quantiles (5 % and 95 %) lie so many standard deviations of errors.
+ERRORS_RANGE = 3.29
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
 #: both axes alike); of strips over an area it is (choice).
 ORBIT_RADIUS_SHARE = 0.8
@@ -55,21 +61,63 @@ def should_fix_focal(
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
     if tilts and np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG) >= MIN_OBLIQUE_SHARE:
         return False, f"{np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG):.0%} oblique views tell it"
-    heights = np.array([photo.relative_altitude for photo in photographs if photo.relative_altitude is not None])
+    known = [photo for photo in photographs if photo.relative_altitude is not None]
+    heights, flights = np.array([photo.relative_altitude for photo in known], float), flights_of(known)
     bent = any(photo.camera_model == FISHEYE for photo in photographs)  # of many terms: one may stand for a height
     if not bent and len(heights) >= 3 and _range(heights) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
-        return False, "flown at several heights, which tell it"
+        if _range(heights - _of_flights(heights, flights)) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
+            return False, "flown at several heights, which tell it"
+        return True, OF_FLIGHTS
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
     if all(photo.lens is not None and photo.lens.source == CALIBRATED_SOURCE for photo in photographs):
         return True, "calibrated by the maker"
     if _is_survey_grid(positions):
         return True, "level strips over an area: the flight cannot tell it, if it looked straight down"
+    if not bent and positions.usable and len(positions.flights) == len(positions):
+        level = positions.enu - _of_flights(positions.enu[:, 2], positions.flights)[:, None] * [0, 0, 1]
+        if _is_survey_grid(replace(positions, enu=level), ERRORS_RANGE * float(np.median(positions.gps_std[:, 2]))):
+            return True, OF_FLIGHTS
     return False, "nothing says that it was flown level, looking straight down"
 
 
-def _is_survey_grid(positions: GpsPriors) -> bool:
-    """Whether photographs were taken from one height all over an area, as a survey is, and not around something."""
+def _of_flights(heights: np.ndarray, flights: np.ndarray) -> np.ndarray:
+    """For each photograph the median height of its flight [n]."""
+    medians = {number: np.median(heights[flights == number]) for number in np.unique(flights)}
+    return np.array([medians[number] for number in flights])
+
+
+def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str], threads: int) -> tuple[bool, str]:
+    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS but the photographs alone show that
+    they were taken from several heights or look several ways. Whether it is held then, and why."""
+    if held != (True, OF_FLIGHTS):
+        return held
+    model = models[0]
+    images = placed_images(model)
+    heights = np.array([_height_over_points(image, model) for image in images])
+    views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
+    ahead = np.median(views, axis=0) / np.linalg.norm(np.median(views, axis=0))
+    oblique = np.mean(views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG)))
+    if _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE:
+        return True, "level strips, as the photographs themselves show, whatever their altitudes say"
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary, options.ceres.solver_options.num_threads = False, threads
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    call_cancellable(lambda cancellation_token: pycolmap.bundle_adjustment(model, options))
+    model.update_point_3d_errors()
+    return False, "several heights or views, as the photographs themselves show, which tell it"
+
+
+def _height_over_points(image: pycolmap.Image, model: pycolmap.Reconstruction) -> float:
+    """Median distance along the view to the points that an image shows."""
+    seen = [model.points3D[each.point3D_id].xyz for each in image.points2D if each.has_point3D()]
+    pose = image.cam_from_world().matrix()
+    return float(np.median(np.array(seen) @ pose[2, :3] + pose[2, 3]))
+
+
+def _is_survey_grid(positions: GpsPriors, errors: float = 0.0) -> bool:
+    """Whether photographs were taken from one height (but for so many metres of errors) all over an area, as a survey
+    is, and not around something."""
     if not positions.usable or not positions.has_altitudes or is_nearly_collinear(positions.enu, positions.gps_std):
         return False
     plane = positions.enu[:, :2] - positions.enu[:, :2].mean(axis=0)
@@ -78,7 +126,7 @@ def _is_survey_grid(positions: GpsPriors) -> bool:
     around = np.quantile(alike, 0.1) > ORBIT_RADIUS_SHARE * np.sqrt(2)
     heights, moments = positions.enu[:, 2], np.arange(len(positions))
     steady = heights - np.polyval(np.polyfit(moments, heights, 1), moments)  # altitudes of receivers drift
-    return not around and min(_range(heights), _range(steady)) <= MIN_HEIGHT_SPREAD * spread[1]
+    return not around and min(_range(heights), _range(steady)) <= np.hypot(errors, MIN_HEIGHT_SPREAD * spread[1])
 
 
 def _range(heights: np.ndarray) -> float:

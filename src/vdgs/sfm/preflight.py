@@ -6,11 +6,12 @@ import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import timedelta
 
 import numpy as np
 from shapely import MultiPoint
 
+from vdgs.sfm.flights import time_of
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -63,7 +64,9 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     footprint = _footprint(photographs, height)
     spread = np.ptp(positions.enu[:, :2], axis=0) if len(positions) else None
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    days = sorted({f"{when:%Y-%m-%d}" for when in (_time(photo.datetime) for photo in photographs) if when is not None})
+    days = sorted(
+        {f"{when:%Y-%m-%d}" for when in (time_of(photo.datetime) for photo in photographs) if when is not None}
+    )
     overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return PreflightReport(
@@ -159,7 +162,7 @@ def _warnings(collection: ImageList, overlap: float | None, views: float | None,
         found.append(
             f"a place is seen by about {views:.1f} photographs; from {MIN_VIEWS_PER_POINT:g} on scenes become good."
         )
-    moments = [when for when in (_time(photo.datetime) for photo in photographs) if when is not None]
+    moments = [when for when in (time_of(photo.datetime) for photo in photographs) if when is not None]
     if moments and max(moments) - min(moments) > timedelta(days=1):
         found.append(f"taken on {len(days)} days, {days[0]} to {days[-1]}: light, shadows and plants may differ.")
     return found
@@ -187,10 +190,3 @@ def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:
         for photo in alike
         if photo.file_bytes < SMALL_FILE_RATIO * statistics.median(each.file_bytes for each in alike)
     ]
-
-
-def _time(text: str) -> datetime | None:
-    try:
-        return datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        return None

@@ -216,6 +216,7 @@ def _steps(
     pairs = _matches(plan, workspace, keys["matches"], console)
     held = incremental_mapper.should_fix_focal(photographs, plan.gps_priors, request.options)
     models = _models(plan, workspace, keys["model"], len(usable), held[0], console)
+    held = incremental_mapper.release_focal(models, held, plan.threads)
     left_out = exclusion_reasons(
         models[0],
         models[1:],

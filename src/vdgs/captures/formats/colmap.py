@@ -20,10 +20,12 @@ from vdgs.captures.formats.colmap_records import ColmapImage, ColmapPoints, empt
 from vdgs.captures.formats.colmap_text import read_cameras_text, read_images_text, read_points3D_text
 from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.source_capture import (
+    BadPose,
     Intrinsics,
     SourceView,
-    find_duplicates,
     format_list,
+    leave_out_bad_poses,
+    one_view_each,
     safe_name,
     to_rigid,
 )
@@ -40,6 +42,8 @@ class ColmapModel:
     views: tuple[SourceView, ...]
     points: np.ndarray
     colors: np.ndarray
+    notes: tuple[str, ...] = ()
+    """What people should know: images that are left out, and why."""
 
 
 def find_models(root: Path) -> list[Path]:
@@ -57,8 +61,8 @@ def _candidates(root: Path) -> list[Path]:
     return candidates
 
 
-def read_colmap(folder: Path) -> ColmapModel:
-    """The sparse model in `folder`, binary where present, else text.
+def read_colmap(folder: Path, strict: bool = False) -> ColmapModel:
+    """The sparse model in `folder`, binary where present, else text; without the few images whose pose is none.
 
     Raises `CaptureError` naming the file if it is missing, truncated, damaged or inconsistent.
     """
@@ -76,7 +80,8 @@ def read_colmap(folder: Path) -> ColmapModel:
             points = (read_points3D_binary if binary else read_points3D_text)(points_file)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
-    return ColmapModel(folder, _views(records, cameras, points, images_file), points.positions, points.colors)
+    views, notes = _views(records, cameras, points, images_file, strict)
+    return ColmapModel(folder, views, points.positions, points.colors, notes)
 
 
 def count_images(folder: Path) -> int:
@@ -127,9 +132,9 @@ def _format(folder: Path) -> str | None:
 
 
 def _views(
-    records: list[ColmapImage], cameras: dict[int, Intrinsics], points: ColmapPoints, file: Path
-) -> tuple[SourceView, ...]:
-    """Posed views in name order; raises on silly poses, unknown cameras and names given twice."""
+    records: list[ColmapImage], cameras: dict[int, Intrinsics], points: ColmapPoints, file: Path, strict: bool
+) -> tuple[tuple[SourceView, ...], tuple[str, ...]]:
+    """Posed views in name order, and notes; raises on many silly poses or names given twice, and on unknown cameras."""
     orphans = [f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras]
     if orphans:
         raise CaptureError(
@@ -137,17 +142,19 @@ def _views(
             f"Both files must come from the same export.{format_list(orphans)}"
         )
     sorted_points = ColmapPoints(*(column[np.argsort(points.point_ids, kind="stable")] for column in points))
-    views = []
+    views, bad = list[SourceView](), dict[str, CaptureError]()
     for record in records:
         intrinsics = cameras[record.camera]
         sightings = _sightings(record, sorted_points, intrinsics)
-        name, pose = safe_name(_below_a_folder(record.name), file), _pose(record, file)
+        name = safe_name(_below_a_folder(record.name), file)
+        try:
+            pose = _pose(record, file)
+        except BadPose as error:
+            bad[name] = error
+            continue
         views.append(SourceView(name=name, camera_from_world=pose, intrinsics=intrinsics, observations=sightings))
-    views.sort(key=lambda view: view.name)
-    twice = find_duplicates(view.name for view in views)
-    if twice:
-        raise CaptureError(f"{file}: the same image name occurs more than once.{format_list(twice)}")
-    return tuple(views)
+    views = sorted(one_view_each(views, file, bad), key=lambda view: view.name)
+    return tuple(views), tuple(leave_out_bad_poses(bad, len(records), file, strict))
 
 
 def _below_a_folder(name: str) -> str:
@@ -174,7 +181,7 @@ def _pose(record: ColmapImage, file: Path) -> np.ndarray:
     quaternion = np.array(record.quaternion)
     near = np.isfinite(quaternion).all() and np.abs(quaternion).max() < 2  # before squares overflow
     if not near or abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
-        raise CaptureError(
+        raise BadPose(
             f"{file}: {label} has the rotation {record.quaternion}, which is not a unit quaternion. "
             "The file is damaged; copy or export the COLMAP model again."
         )

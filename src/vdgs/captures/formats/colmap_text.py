@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +19,8 @@ from vdgs.captures.formats.colmap_records import (
 )
 from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics
 from vdgs.errors import CaptureError
+
+_NO_NUMBER = re.compile(r"[+-]?(?:nan|inf)\(.*\)|[+-]?1\.#\w+", re.IGNORECASE)
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
@@ -40,6 +44,11 @@ def _whole(word: str) -> int:
     if not number.is_integer():
         raise ValueError(word)
     return int(number)
+
+
+def _number(word: str) -> float:
+    """A number of a pose, NaN also as programs write it on Windows: `-nan(ind)`, `-1.#IND`. ValueError for others."""
+    return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
 
 
 def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
@@ -71,7 +80,7 @@ def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapIma
         words = line.split(maxsplit=9)
         try:
             _, camera = int(words[0]), int(words[8])
-            pose = [float(word) for word in words[1:8]]
+            pose = [_number(word) for word in words[1:8]]
             name = words[9].strip()
         except (ValueError, IndexError):
             raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
@@ -88,7 +97,7 @@ def _is_pose(line: str) -> bool:
     """Whether a line is the pose of another image, which ends in a name, where points are expected."""
     words = line.split(maxsplit=9)
     try:
-        _ = int(words[0]), int(words[8]), [float(word) for word in words[1:8]]
+        _ = int(words[0]), int(words[8]), [_number(word) for word in words[1:8]]
         float(words[9].split()[0])
     except IndexError:
         return False

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import BROWN, Intrinsics, check_intrinsics
+from vdgs.captures.formats.source_capture import BROWN, BadPose, Intrinsics, check_intrinsics
 from vdgs.captures.image_files import read_header
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -46,10 +46,10 @@ def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise CaptureError(f"{file}: {label} needs a 4x4 matrix of finite numbers. Export it again.")
+        raise BadPose(f"{file}: {label} needs a 4x4 matrix of finite numbers. Export it again.")
     if len(matrix) == 4 and np.abs(matrix[3, :3]).max() > 1e-6 * np.abs(matrix).max():
         way = " It seems transposed: the place belongs into the last column." if not matrix[:3, 3].any() else ""
-        raise CaptureError(f"{file}: {label} has a matrix whose last row is not 0 0 0 1.{way} Export it again.")
+        raise BadPose(f"{file}: {label} has a matrix whose last row is not 0 0 0 1.{way} Export it again.")
     result = np.eye(4)
     result[:3] = matrix[:3]
     return result

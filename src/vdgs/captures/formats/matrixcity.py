@@ -23,11 +23,12 @@ from vdgs.captures.formats.json_poses import (
     read_capture_json,
 )
 from vdgs.captures.formats.source_capture import (
+    BadPose,
     SourceCapture,
     SourceView,
     WorldPrior,
-    find_duplicates,
-    format_list,
+    leave_out_bad_poses,
+    one_view_each,
     refuse_many_missing,
     to_rigid,
 )
@@ -71,6 +72,7 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views: list[SourceView] = []
     scales: set[float] = set()
     missing: list[str] = []
+    bad: dict[str, CaptureError] = {}
     count, is_city = 0, False
     for file, split in files:
         content = read_capture_json(file)
@@ -80,13 +82,16 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
             if isinstance(image, str):
                 missing.append(image)
                 continue
-            view, scale = _read_frame(image, frame, content, file, split)
+            try:
+                view, scale = _read_frame(image, frame, content, file, split)
+            except BadPose as error:
+                bad[image[0]] = error
+                continue
             views.append(view)
             scales.add(scale)
     warnings = _missing(missing, count, root, options.strict)
-    twice = find_duplicates(view.name for view in views)
-    if twice:
-        raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{format_list(twice)}")
+    views = one_view_each(views, root, bad)
+    warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
     if len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}

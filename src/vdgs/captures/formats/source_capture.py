@@ -6,8 +6,7 @@ already in OpenCV camera axes. `loading` turns it into a checked `Capture` in th
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -19,6 +18,7 @@ from vdgs.captures.georeference import Georef
 from vdgs.captures.name_resolution import find_file, without_uri
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
+from vdgs.system.units import first_names
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).
 CAMERA_MODELS: dict[int, tuple[str, int]] = {
@@ -47,10 +47,16 @@ MAX_SIDE_PX = 100_000
 MAX_LISTED, MAX_MISSING_LISTED = 10, 100
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
 LEAST_THERE = 2 / 3
+#: Poses that cannot be used are left out where they are at most this share, or one of three or more (choice).
+FEW_BAD = 0.1
 
 
 class NoTiePoints(CaptureError):
     """A capture or project with poses but without points, which `vdgs sfm` finds."""
+
+
+class BadPose(CaptureError):
+    """A pose that is none."""
 
 
 @dataclass(frozen=True)
@@ -147,17 +153,38 @@ def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict:
     return [f"{len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
 
 
+def leave_out_bad_poses(bad: Mapping[str, CaptureError], count: int, file: Path, strict: bool = False) -> list[str]:
+    """A warning about photographs whose pose cannot be used, by their names, with the errors; the first of these is
+    raised where they are more than a few of `count`, or a person is `strict`."""
+    if not bad:
+        return []
+    error = next(iter(bad.values()))
+    if strict or count < 3 or len(bad) > max(1, FEW_BAD * count):
+        raise error
+    why = str(error).removeprefix(f"{file}: ")
+    return [f"{file.name}: {first_names(list(bad))}: left out, for the pose cannot be used. {why}"]
+
+
+def one_view_each(views: Sequence[SourceView], file: Path, bad: dict[str, CaptureError]) -> list[SourceView]:
+    """The views, each name once: the first of those with one pose. Names with several poses go to `bad`."""
+    named: dict[str, list[SourceView]] = {}
+    for view in views:
+        named.setdefault(view.name, []).append(view)
+    for name, doubles in named.items():
+        poses = np.array([view.camera_from_world for view in doubles])
+        if len({view.intrinsics for view in doubles}) > 1 or not np.allclose(poses, poses[0], rtol=1e-6, atol=1e-6):
+            bad[name] = CaptureError(
+                f"{file}: the same image occurs more than once, with different poses. Keep one.{format_list([name])}"
+            )
+    return [doubles[0] for name, doubles in named.items() if name not in bad]
+
+
 def format_list(names: Iterable[str], most: int = MAX_LISTED) -> str:
     """Up to ten names, or as many as asked for, one a line, and how many more there are."""
     names = list(names)
     shown = "".join(f"\n  {name}" for name in names[:most])
     more = len(names) - most
     return shown + (f"\n  ... and {more} more" if more > 0 else "")
-
-
-def find_duplicates(names: Iterable[str]) -> list[str]:
-    """Names that occur more than once, sorted."""
-    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def safe_name(name: str, file: Path, what: str = "image name", root: Path | None = None) -> str:
@@ -241,7 +268,7 @@ def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3
     elif np.linalg.det(matrix[:3, :3]) < 0:
         problem = "a pose that mirrors the world"
     if problem:
-        raise CaptureError(f"{file}: {label} has {problem}. The file is damaged or of another convention.")
+        raise BadPose(f"{file}: {label} has {problem}. The file is damaged or of another convention.")
     left, _, right = np.linalg.svd(matrix[:3, :3])
     result = np.eye(4)
     result[:3, :3] = left @ right

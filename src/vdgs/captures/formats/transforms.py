@@ -23,11 +23,13 @@ from vdgs.captures.formats.json_poses import (
 )
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import (
+    BadPose,
     SourceCapture,
     SourceView,
-    find_duplicates,
     find_image,
     format_list,
+    leave_out_bad_poses,
+    one_view_each,
     refuse_many_missing,
     safe_name,
     to_rigid,
@@ -78,6 +80,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     splits = _splits(content, names, file, root, options)
     undo = _undo_applied(content, file)
     views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
+    bad = dict[str, CaptureError]()
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
         image = find_image(root, f"{chosen}/{short}" if chosen else short)
@@ -85,13 +88,14 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
             missing.append(short)
             continue
         short += image.suffix if image.stem == PurePosixPath(short).name else ""
-        world_from_camera = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
-        in_file = to_rigid(world_from_camera, file, f"frame {name!r}")
+        try:
+            matrix = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
+            in_file = to_rigid(matrix, file, f"frame {name!r}")
+        except BadPose as error:
+            bad[short] = error
+            continue
         pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
         intrinsics = parse_intrinsics(frame, content, image, file)
-        mask = frame.get("mask_path")
-        mask_path = safe_name(str(mask), file, "mask_path", root) if mask else None
-        mask_file = (find_file(root, mask_path) or root / mask_path) if mask_path else None
         views.append(
             SourceView(
                 name=short,
@@ -99,13 +103,13 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
                 intrinsics=intrinsics,
                 split=splits.get(name),
                 image_path=image,
-                mask_path=mask_file,
+                mask_path=_mask(frame, file, root),
             )
         )
     warnings = notes + refuse_many_missing(missing, len(frames), root / chosen, options.strict)
-    twice = find_duplicates(view.name for view in views)
-    if twice:
-        raise CaptureError(f"{file}: the same image occurs more than once.{format_list(twice)}")
+    views = one_view_each(views, file, bad)
+    warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
+    poses = {view.name: poses[view.name] for view in views}
     points, colors = _points(root, content, file, poses, needs_points)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
@@ -126,6 +130,12 @@ def _name(frame: JsonObject, file: Path, root: Path) -> str:
     if not isinstance(path, str):
         raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
     return safe_name(path, file, "file_path", root)
+
+
+def _mask(frame: JsonObject, file: Path, root: Path) -> Path | None:
+    mask = frame.get("mask_path")
+    name = safe_name(str(mask), file, "mask_path", root) if mask else None
+    return (find_file(root, name) or root / name) if name else None
 
 
 def _common_folder(names: list[str]) -> str:

@@ -1,0 +1,97 @@
+"""What the columns of tables are called, and the units that their names say."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Sequence
+
+#: What each column is called, once blanks, signs, accents, units and the case of letters are taken away.
+_COLUMNS: dict[str, frozenset[str]] = {
+    what: frozenset(names.split())
+    for what, names in {
+        "name": "name label image imagename imagefile imagefilename filename file sourcefile photo photoname "
+        "photograph picture picturename img imgname path filepath imagepath cameraname photolabel "
+        "dateiname bildname bild nombre imagen fichier nomdufichier nomefile 照片名称 文件名 名称",
+        "lat": "lat latitude gpslatitude gpslat ylatitude latitudey latitudedeg latdeg wgs84lat wgs84latitude "
+        "latitudewgs84 ylat cameralatitude originallatitude breite breitengrad latitud latitudine 纬度",
+        "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
+        "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude lange langengrad "
+        "longitud longitudine 经度",
+        "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
+        "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
+        "heightellipsoid ellh elevationm altft altitudeft altitudefeet heightft hohe altitud altura quota 高度 海拔",
+        "x": "x pointx "
+        "easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
+        "y": "y pointy northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
+        "nordwert norte",
+        "latref": "latref latituderef gpslatituderef",
+        "lonref": "lonref longituderef gpslongituderef",
+        "altref": "altref altituderef gpsaltituderef",
+        "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror accuracyxy errorxy "
+        "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy",
+        "eastwards": "rmsx stdx sdx sigmax xrms "
+        "rmseasting eastingrms sde stddeve sigmae accuracyxeasting accuracyxlongitude accuracyx",
+        "northwards": "rmsy stdy sdy sigmay yrms "
+        "rmsnorthing northingrms sdn stddevn sigman accuracyynorthing accuracyylatitude accuracyy",
+        "upwards": "accuracyvertical verticalaccuracy vacc accuracyv vdev verticalerror accuracyz errorz "
+        "verticalaccuracym zaccuracy "
+        "rmsz stdz sdz sigmaz zrms rmselevation elevationrms sdu stddevu sigmau accuracyzaltitude",
+        "system": "epsg crs srs epsgcode",
+    }.items()
+}  # fmt: skip
+_UNIT = re.compile(
+    r"[\[(][^\])]*[\])]|[_ ](?:decimal degrees|dd|deg|degrees|rad(?:ians)?|[kcm]?m|met(?:er|re)s?"
+    r"|(?:us[ _]?)?f(?:oo|ee)?t)$"
+)
+#: How the names of columns, and values, say that they are feet.
+_FEET = re.compile(r"(?:[\[( _\d]|^alt|^altitude|^height)(us[ _]?(?:survey[ _]?)?)?(?:ft|feet|foot)\b", re.IGNORECASE)
+FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
+#: Names of columns of altitudes that others of a table give way to: heights may be those over the ground.
+_ALTITUDE = re.compile(r"alt(?!ura)|elli?p|ellh|elev|海拔", re.IGNORECASE)
+#: Altitudes by names that are put together: `ell_hgt`, `alt_msl`, `Orthometric elevation`, `pointz`; none over ground.
+_ALTITUDES = re.compile(
+    r"(?:gps|gnss|abs|absolute|ell|ellips|ellipsoid(?:al)?|ortho|orthometric|msl|amsl|wgs84|camera|geoid|sensor)*"
+    r"(?:altitude|alt|height|hgt|hght|elevation|elev)"
+    r"(?:gps|abs|ell|ellips|ellipsoid(?:al)?|ortho|msl|amsl|wgs84|m)*|pointz"
+)
+#: Numbers with signs between thousands and another one before the decimals: 6,292,126.02 and 6.292.126,02.
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:,\d{3})+\.\d+|(?:\.\d{3})+,\d+)")
+#: Units of columns: parts of metres, and angles.
+_PARTS = re.compile(r"[\[( _](mm|cm|km)\b", re.IGNORECASE)
+ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
+RADIANS = re.compile(r"[\[( _]rad(?:ians)?\b", re.IGNORECASE)
+
+
+def known_columns(words: Sequence[str]) -> dict[str, int]:
+    """Which of these names of columns is what."""
+    found: dict[str, int] = {}
+    for k, word in enumerate(words):
+        letters = unicodedata.normalize("NFKD", word.lower())  # accents are signs of their own, brackets are narrow
+        plain = re.sub(r"[\W_]", "", _UNIT.sub("", letters))
+        what = next((what for what, names in _COLUMNS.items() if plain in names), None)
+        what = "alt" if what is None and _ALTITUDES.fullmatch(plain) else what
+        if what == "alt" and what in found and _ALTITUDE.search(word) and not _ALTITUDE.search(words[found[what]]):
+            found[what] = k
+        elif what is not None:
+            found.setdefault(what, k)
+    return found
+
+
+def meters_of(word: str) -> float:
+    """How many metres the unit has that a word names: feet, US survey feet, parts of metres, or metres."""
+    feet = _FEET.search(word)
+    if parts := _PARTS.search(word):
+        return {"mm": 1e-3, "cm": 1e-2, "km": 1e3}[parts[1].lower()]
+    return 1.0 if feet is None else SURVEY_FOOT_M if feet[1] else FOOT_M
+
+
+def number_of(word: str) -> float:
+    """The number that a word says; NaN where it says none."""
+    if _THOUSANDS.fullmatch(word):  # the last sign is the decimal one
+        word = re.sub(r"[.,](?=.*[.,])", "", word).replace(",", ".")
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan

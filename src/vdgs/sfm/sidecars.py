@@ -1,0 +1,78 @@
+"""What files beside a photograph say of where and when it was taken, whose own tags were stripped."""
+
+from __future__ import annotations
+
+import json
+import re
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from vdgs.sfm.exif_gps import finite, read_altitude, read_place
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.xmp import read_xmp
+
+#: Google Takeout cuts names at so many letters, before the number of a double and `.json`.
+_TAKEOUT_LETTERS = 46
+_DOUBLE = re.compile(r"(.*?)(?:-edited)?(\(\d+\))?")
+#: Larger files are none (bytes).
+_LARGEST = 1 << 20
+
+
+def with_sidecars(photo: ImageMetadata) -> ImageMetadata:
+    """A photograph without a position with the one of Google Takeout's JSON, or of an XMP file, beside it."""
+    if photo.lat_lon is not None:
+        return photo
+    for file in _takeout_names(photo.path):
+        content = _read_json(file)
+        geo = [content.get(key) for key in ("geoDataExif", "geoData")]  # the camera's before what people set
+        for place in (each for each in geo if isinstance(each, dict)):
+            latitude, longitude, altitude = (finite(place.get(key)) for key in ("latitude", "longitude", "altitude"))
+            if latitude is None or longitude is None or not (latitude or longitude) or abs(latitude) > 90:
+                continue
+            kind = f"{file.suffix} of Google Takeout as recorded, datum not stated"
+            return replace(
+                photo, lat_lon=(latitude, longitude), altitude=altitude or None, altitude_type=kind,
+                datetime=photo.datetime or _moment(content), doubts=(*photo.doubts, _beside(file)),
+            )  # fmt: skip
+    for file in (photo.path.with_suffix(".xmp"), photo.path.with_name(f"{photo.path.name}.xmp")):
+        if file.is_file() and file.stat().st_size < _LARGEST:
+            xmp = read_xmp(file.read_bytes())
+            position, _ = read_place({}, xmp)
+            if position is not None:
+                altitude, kind = read_altitude({}, xmp)
+                doubts = (*photo.doubts, _beside(file))
+                return replace(photo, lat_lon=position, altitude=altitude, altitude_type=kind, doubts=doubts)
+    return photo
+
+
+def _beside(file: Path) -> str:
+    return f"says no position; that of the {file.suffix} beside it is used ({file.name})"
+
+
+def _takeout_names(path: Path) -> list[Path]:
+    """What Takeout calls the JSON of a photograph, today and until 2024."""
+    match = _DOUBLE.fullmatch(path.stem)
+    stem, double = (match[1], match[2] or "") if match else (path.stem, "")
+    name = f"{stem}{path.suffix}"
+    whole = (f"{name}.supplemental-metadata", name)
+    return [path.with_name(f"{each[:_TAKEOUT_LETTERS]}{double}.json") for each in whole]
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    with suppress(OSError, ValueError, RecursionError):
+        if file.stat().st_size < _LARGEST:
+            content = json.loads(file.read_text(encoding="utf-8-sig"))
+            return content if isinstance(content, dict) else {}
+    return {}
+
+
+def _moment(content: dict[str, Any]) -> str:
+    """EXIF's form of the moment, in UTC."""
+    taken = content.get("photoTakenTime")
+    with suppress(TypeError, ValueError, OverflowError, OSError):
+        if isinstance(taken, dict):
+            return f"{datetime.fromtimestamp(int(taken['timestamp']), UTC):%Y:%m:%d %H:%M:%S}"
+    return ""

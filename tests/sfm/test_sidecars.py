@@ -1,0 +1,39 @@
+"""Positions in files beside photographs whose own tags were stripped."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vdgs.sfm.image_metadata import read_image_metadata
+from vdgs.sfm.sidecars import with_sidecars
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("photo", "beside"),
+    [
+        ("IMG_1.jpg", "IMG_1.jpg.supplemental-metadata.json"),
+        ("IMG_1(2).jpg", "IMG_1.jpg.supplemental-metadata(2).json"),
+        ("PXL_20240612_101112131-edited.jpg", "PXL_20240612_101112131.jpg.supplemental-metada.json"),
+        ("DJI_1.jpg", "DJI_1.jpg.json"),
+        ("IMG_1.jpg", "IMG_1.xmp"),
+        ("IMG_1.jpg", "IMG_1.jpg.xmp"),
+    ],
+)
+def test_positions_of_files_beside_stripped_photographs_are_used(tmp_path, photo, beside):
+    Image.fromarray(NOISE).save(tmp_path / photo)
+    geo = {"latitude": 30.5, "longitude": -104.25, "altitude": 486.5}
+    content = {"geoData": {**geo, "latitude": 31.0}, "geoDataExif": geo, "photoTakenTime": {"timestamp": "1258375918"}}
+    xmp = '<rdf:Description exif:GPSLatitude="30,30.0N" exif:GPSLongitude="104,15.0W" exif:GPSAltitude="4865/10"/>'
+    (tmp_path / beside).write_text(xmp if beside.endswith("xmp") else json.dumps(content))
+    found = with_sidecars(read_image_metadata(tmp_path / photo, photo))
+    assert (found.lat_lon, found.altitude) == (pytest.approx((30.5, -104.25)), 486.5)
+    assert found.datetime == ("" if beside.endswith("xmp") else "2009:11:16 12:51:58")
+    assert beside in found.doubts[0]
+    (tmp_path / beside).write_text("[[" if beside.endswith("json") else "<")
+    assert with_sidecars(read_image_metadata(tmp_path / photo, photo)).lat_lon is None
