@@ -69,7 +69,7 @@ class ViewExposures:
         for image, view in enumerate(self._trained):
             position = self._positions[view.name]
             self._flights[position.flight][position.number] = image
-        self._metered = cache(lambda image: log_luminance(self._render_small(self._trained[image])))
+        self._measured = cache(self._measure)
 
     def __call__(self, view: View) -> Float[Tensor, "3 4"]:
         """The color model of a view, [A | b] in float64."""
@@ -79,13 +79,13 @@ class ViewExposures:
         near = find_flight_neighbors(images, position.number)
         if near is None or position.number in images or not self.auto_exposure.slope:
             return exposure
-        expected = (1 - near.share) * self._metered(near.first) + near.share * self._metered(near.last)
+        expected = (1 - near.share) * self._measured(near.first)[0] + near.share * self._measured(near.last)[0]
         return exposure * self.auto_exposure.gain(log_luminance(self._render_small(view)) - expected)
 
     @cached_property
     def auto_exposure(self) -> AutoExposure:
         """How the cameras of this capture meter, from training photographs between two others."""
-        brighter, gains = [], []
+        departures: list[np.ndarray] = []
         last = len(self._trained) - 1
         chosen = np.unique(np.linspace(0, last, min(MAX_SAMPLE_VIEWS, last + 1)).astype(int))
         for image in chosen.tolist():
@@ -94,15 +94,19 @@ class ViewExposures:
             if near is None or near.first == near.last:
                 continue
             shares = {near.first: 1 - near.share, near.last: near.share}
-            brighter.append(self._metered(image) - sum(s * self._metered(other) for other, s in shares.items()))
-            gains.append(self._gain(image) - sum(s * self._gain(other) for other, s in shares.items()))
-        return fit_auto_exposure(np.array(brighter), np.array(gains))
+            between = sum(s * np.array(self._measured(other)) for other, s in shares.items())
+            departures.append(np.array(self._measured(image)) - between)
+        brighter, gains = np.array(departures).reshape(-1, 2).T
+        return fit_auto_exposure(brighter, gains)
 
-    def _gain(self, image: int) -> float:
-        """By how much a training photograph is brighter than neutral, as a logarithm."""
-        neutral = torch.from_numpy(self._render_small(self._trained[image])).double()
-        exposed = apply_exposure(neutral, exposure_matrix(self._departures, image)).clamp(0, 1).numpy()
-        return log_luminance(exposed) - self._metered(image)
+    def _measure(self, image: int) -> tuple[float, float]:
+        """What a camera meters in the view of a training photograph, and by how much the photograph is brighter than
+        neutral, as logarithms."""
+        neutral = self._render_small(self._trained[image])
+        exposure = exposure_matrix(self._departures, image)
+        exposed = apply_exposure(torch.from_numpy(neutral).double(), exposure).clamp(0, 1).numpy()
+        metered = log_luminance(neutral)
+        return metered, log_luminance(exposed) - metered
 
     def _render_small(self, view: View) -> Float[np.ndarray, "h w 3"]:
         """A view in neutral colors, small."""
