@@ -10,14 +10,16 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vdgs.config.method import TrainConfig
 from vdgs.errors import TrainingDiverged
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
-from vdgs.kernels.kernel_types import DecoderWeights, IsFinite, OrderedSplats, SplatGradients
+from vdgs.kernels.kernel_types import DecoderWeights, IsFinite, OrderedSplats, Raster, SplatGradients
 from vdgs.kernels.transfer import is_host
 from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
 from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
@@ -25,9 +27,18 @@ from vdgs.training.densification_step import densify, sort_morton
 from vdgs.training.depth_agreement import DepthAgreement, depth_agreement
 from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.optimizer import learning_rates_at
+from vdgs.training.pseudo_views import is_pseudo_view_due, pseudo_camera, warp_photograph
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.sky_background import with_sky
-from vdgs.training.target import background_at, crop_box, crop_camera, levels_at, make_target, opacity_factors_at
+from vdgs.training.target import (
+    TrainingTarget,
+    background_at,
+    crop_box,
+    crop_camera,
+    levels_at,
+    make_target,
+    opacity_factors_at,
+)
 from vdgs.training.training_state import StepReport, TrainingProblem, TrainingState
 from vdgs.training.training_step import (
     RenderedTrainingView,
@@ -48,6 +59,8 @@ REFERENCE_HEIGHT = 10.0
 SORT_INTERVAL = 1000
 #: Every so many iterations sizes are clamped to their bounds, and whenever a model is averaged or complete.
 BOUND_INTERVAL = 10
+#: The stream of random numbers from which pseudo views are drawn.
+PSEUDO_STREAM = 77
 #: Every so many iterations the PSNR of the training view is computed, for the log.
 PSNR_LOG_INTERVAL = 10
 
@@ -80,13 +93,13 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     rows = cull_anchors(levels_at(state.anchors, config.seed, iteration), camera)
     rows = rows if stage.select_rows is None else stage.select_rows(state, rows, camera)
     weights = state.decoder.weights_for_image(image_index_at(stage, view))
-    background = background_at(stage, iteration)
+    background, with_pseudo_view = background_at(stage, iteration), is_pseudo_view_due(config, iteration)
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
         target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
         frozen = _frozen_splats(stage, view, camera, target.camera, iteration)
         drawn = render_for_training(
-            splats, target.camera, background, frozen, depth=bool(config.loss.depth_agreement),
+            splats, target.camera, background, frozen, depth=with_pseudo_view or bool(config.loss.depth_agreement),
             opacity_factors=opacity_factors_at(stage, iteration, len(splats.source)),
         )  # fmt: skip
     drawn = with_sky(drawn, stage, view, state.decoder, target.camera, background)
@@ -105,6 +118,8 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     psnr = training_psnr(compared.shown, target.image, target.mask) if measured else None
     state.is_consistent = False
     finite = _move(state, stage, rows, gradients, weights, camera)
+    if with_pseudo_view:
+        finite = pseudo_step(state, stage, view, target, drawn.raster) & finite
 
     growing = iteration + 1 <= config.densify.stop_fraction * config.iterations
     if growing and iteration + 1 > config.densify.stats_start:
@@ -114,6 +129,14 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
     if growing and state.iteration >= config.densify.start and state.iteration % config.densify.every == 0:
         report = replace(report, **(stage.grow or densify)(state, stage))
+    _sort_bound_and_average(state, config)
+    _smooth(state, value, psnr)
+    state.is_consistent = True
+    return report
+
+
+def _sort_bound_and_average(state: TrainingState, config: TrainConfig) -> None:
+    """What is due after a step, whatever it drew."""
     if state.iteration % SORT_INTERVAL == 0:
         sort_morton(state)
     last, averaged = state.iteration == config.iterations, is_averaged_step(state.iteration, config)
@@ -121,9 +144,32 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
         _bound_sizes(state)
     if averaged:
         _average(state)
-    _smooth(state, value, psnr)
-    state.is_consistent = True
-    return report
+
+
+def pseudo_step(
+    state: TrainingState, stage: TrainingProblem, view: int, target: TrainingTarget, shown: Raster
+) -> IsFinite:
+    """Draw a pseudo view near a view that was drawn with depth, compare it with the view's photograph where both show
+    the same places, and move what it shows: whether all gradients were finite. Nothing where there are too few such
+    places."""
+    config, iteration = stage.config, state.iteration
+    rng = np.random.default_rng((config.seed, PSEUDO_STREAM, iteration))
+    camera = pseudo_camera(target.camera, shown, rng)
+    rows = None if camera is None else cull_anchors(levels_at(state.anchors, config.seed, iteration), camera)
+    if camera is None or rows is None or not len(rows):
+        return True
+    rows = rows if stage.select_rows is None else stage.select_rows(state, rows, camera)
+    weights = state.decoder.weights_for_image(image_index_at(stage, view))
+    with torch.no_grad():
+        splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
+        frozen = _frozen_splats(stage, view, camera, camera, iteration)
+        drawn = render_for_training(splats, camera, background_at(stage, iteration), frozen, depth=True)
+    wanted = warp_photograph(target, shown, camera, drawn.raster, stage.camera_height)
+    if wanted is None or not len(drawn.source):
+        return True
+    weight = stage.loss_weight * config.loss.pseudo_views
+    compared = compute_loss(drawn, wanted, state.decoder, image_index_at(stage, view), config, weight)
+    return _move(state, stage, rows, drawn.backward(compared.image, 0.0), weights, camera)
 
 
 def _read_values(values: Float[Tensor, "3"], finite: IsFinite, iteration: int) -> tuple[float, float, float]:

@@ -1,0 +1,121 @@
+"""Views for training that nobody photographed: nearer to a place of a photograph, more tilted and turned aside.
+
+A model that shows its photographs well may show anything beside them. In a pseudo view (FSGS's word) each pixel shows a
+place; where the photograph of the step sees the same place, by the depth of the model in both views, its color there is
+what the pixel should show. No gradient passes through depths.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import NEAR_PLANE, Camera
+from vdgs.kernels.kernel_types import Raster
+from vdgs.kernels.transfer import to_like
+from vdgs.training.target import TrainingTarget
+
+#: Every so many steps draw a pseudo view, after this share of the iterations: before it depths are vague.
+EVERY, START_FRACTION = 5, 0.3
+#: In degrees: by how much more a pseudo view is tilted than its photograph, and up to what tilt; how far it is turned
+#: about its place to either side, and below what tilt of the photograph by any angle. Then its distance from the place,
+#: in those of the photograph. From nearer and with more tilt photographs tell too little (reports/off-path.md).
+MORE_TILT, MAX_TILT, TURN, LEVEL_TILT = 35.0, 80.0, 25.0, 15.0
+NEARER = (0.4, 1.0)
+#: Two depths agree when they differ by less than this share of the camera height; both pixels are at least so opaque.
+MAX_DIFFERENCE, MIN_ALPHA = 0.01, 0.9
+#: A pseudo view of which the photograph sees less than this share is not used.
+MIN_SHARE = 0.05
+#: Places of a photograph that are tried as the middle of a pseudo view.
+_TRIES = 8
+
+
+def is_pseudo_view_due(config: TrainConfig, iteration: int) -> bool:
+    """Whether iteration (from 0) draws a pseudo view beside its photograph."""
+    begun = iteration >= START_FRACTION * config.iterations
+    return config.loss.pseudo_views > 0 and begun and iteration % EVERY == 0
+
+
+def pseudo_camera(camera: Camera, raster: Raster, rng: np.random.Generator) -> Camera | None:
+    """A camera about a place that a view, drawn with depth, shows; None where the places tried show nothing."""
+    rows, columns = rng.integers(camera.height, size=_TRIES), rng.integers(camera.width, size=_TRIES)
+    assert raster.median_depth is not None
+    depths, alphas = torch.stack([each[rows, columns] for each in (raster.median_depth, raster.alpha)]).tolist()
+    tried = zip(rows, columns, depths, alphas, strict=True)
+    place = next(((r, c, depth) for r, c, depth, alpha in tried if alpha > MIN_ALPHA and depth > 0), None)
+    if place is None:
+        return None
+    row, column, depth = place
+    across = np.array([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0])
+    middle = camera.position + depth * across @ camera.camera_from_world[:3, :3]
+    back = camera.position - middle
+    distance = float(np.linalg.norm(back))
+    tilt, heading = math.degrees(math.acos(min(max(back[2] / distance, -1.0), 1.0))), math.atan2(back[1], back[0])
+    turn = 180.0 if tilt < LEVEL_TILT else TURN
+    heading += math.radians(rng.uniform(-turn, turn))
+    tilt = math.radians(min(tilt + rng.uniform(0, MORE_TILT), max(tilt, MAX_TILT)))
+    away = np.array([math.cos(heading) * math.sin(tilt), math.sin(heading) * math.sin(tilt), math.cos(tilt)])
+    pose = _looking_at(middle + distance * rng.uniform(*NEARER) * away, middle, heading)
+    return replace(camera, camera_from_world=pose, cx=camera.width / 2, cy=camera.height / 2, uncropped_size=None)
+
+
+def _looking_at(position: np.ndarray, middle: np.ndarray, heading: float) -> np.ndarray:
+    """`camera_from_world` of a camera that looks at a place from the side that `heading` names, the horizon level."""
+    forward = (middle - position) / np.linalg.norm(middle - position)
+    right = np.array([-math.sin(heading), math.cos(heading), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
+@torch.no_grad()
+def warp_photograph(
+    target: TrainingTarget, shown: Raster, camera: Camera, raster: Raster, camera_height: float
+) -> TrainingTarget | None:
+    """What a pseudo view, drawn as `raster`, should show by a photograph whose view was drawn as `shown`, both with
+    depth; None where the photograph sees too little of it."""
+    assert raster.median_depth is not None
+    assert shown.median_depth is not None
+    depth = raster.median_depth
+    there, inside = _project(target.camera, _unproject(camera, depth))
+    size = to_like([target.camera.width, target.camera.height], there)
+    grid = (2 * there[..., :2] / size - 1)[None]
+    known = [shown.median_depth, shown.alpha, *([] if target.mask is None else [target.mask.to(depth)])]
+    found = grid_sample(torch.stack(known)[None], grid, mode="nearest", align_corners=False)[0]
+    agrees = (found[0] - there[..., 2]).abs() < MAX_DIFFERENCE * camera_height
+    counts = inside & agrees & (found[1:] > MIN_ALPHA).all(0) & (raster.alpha > MIN_ALPHA) & (depth > 0)
+    share = float(counts.float().mean())
+    if share < MIN_SHARE:
+        return None
+    colors = target.image.to(depth).permute(2, 0, 1)[None]
+    warped = grid_sample(colors, grid, align_corners=False, padding_mode="border")[0].permute(1, 2, 0)
+    image = warped.round_().clamp_(0, 255).to(torch.uint8).contiguous()
+    return TrainingTarget(image=image, mask=counts.to(torch.uint8), camera=camera, valid_fraction=share)
+
+
+def _unproject(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+    """The places of pixels, as `Camera.unproject`."""
+    x = (torch.arange(camera.width, device=depth.device) + 0.5 - camera.cx) / camera.fx
+    y = (torch.arange(camera.height, device=depth.device) + 0.5 - camera.cy) / camera.fy
+    local = (
+        torch.stack([x.expand_as(depth), y[:, None].expand_as(depth), torch.ones_like(depth)], -1) * depth[..., None]
+    )
+    return (local - to_like(camera.camera_from_world[:3, 3], depth)) @ to_like(camera.camera_from_world[:3, :3], depth)
+
+
+def _project(camera: Camera, places: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Tensor]:
+    """Pixels and depths of places, and which of them lie in the picture, as `Camera.project` and `holds`."""
+    local = places @ to_like(camera.camera_from_world[:3, :3], places).T
+    local = local + to_like(camera.camera_from_world[:3, 3], places)
+    depth = local[..., 2]
+    x, y = camera.fx * local[..., 0] / depth + camera.cx, camera.fy * local[..., 1] / depth + camera.cy
+    inside = (depth > NEAR_PLANE) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return torch.stack([x, y, depth], -1), inside
