@@ -44,7 +44,7 @@ class BaselineStage:
 
     #: Its settings, from those of the run: iterations, seed, number of blocks, limit of anchors.
     settings: Callable[[MethodConfig], Any]
-    #: Called as run(run folder, capture, settings, console, lpips_weights=...).
+    #: Called as run(run folder, capture, settings, console, lpips_weights=..., device=...).
     run: Callable[..., object]
     #: The folder in the run, if it is not that of the stage's name.
     folder: str = ""
@@ -93,13 +93,19 @@ def _gaussian_blocks(name: str, train: Callable[[BlockScene], Gaussians]) -> Bas
     """A method of explicit Gaussians in blocks, in RUN/gaussians."""
 
     def run_blocks(
-        run: RunFolder, capture: Capture, config: GaussianBlocksConfig, console: Console, *, lpips_weights: Path | None
+        run: RunFolder,
+        capture: Capture,
+        config: GaussianBlocksConfig,
+        console: Console,
+        *,
+        lpips_weights: Path | None,
+        device: str = "cpu",
     ) -> None:
         folder = gaussians_folder(run)
         with run.locked():
             require_trainable(capture, console)
             with folder.locked():
-                model = train_scene(capture, config, folder, train, console)
+                model = train_scene(capture, config, folder, train, console, device=device).to(device)
             write_json(run.capture_file, capture_metadata(capture))
         evaluate_gs3d(model, capture, run.evaluation, console, lpips_weights=lpips_weights, trained=folder, method=name)
 
@@ -125,9 +131,12 @@ def baseline_folder(run: RunFolder, stages: tuple[str, ...]) -> StageFolder | No
     return StageFolder(run.path / (baseline.folder or stages[0])) if baseline else None
 
 
-def train_baseline(name: str, run: RunFolder, capture: Capture, lpips_weights: Path | None, console: Console) -> None:
-    """Train, or continue, such a method for the settings of a run and measure it. What was trained for other settings
-    or on another choice of photographs goes first (that it may go was asked before: `RunFolder.change_settings`).
+def train_baseline(
+    name: str, run: RunFolder, capture: Capture, lpips_weights: Path | None, console: Console, device: str = "cpu"
+) -> None:
+    """Train, or continue, such a method for the settings of a run on a device, and measure it there. What was trained
+    for other settings or on another choice of photographs goes first (that it may go was asked before:
+    `RunFolder.change_settings`).
 
     Raises what its `run` raises.
     """
@@ -138,4 +147,4 @@ def train_baseline(name: str, run: RunFolder, capture: Capture, lpips_weights: P
     assert folder is not None
     with run.locked():
         folder.reset_unless(hashlib.sha256(made_for.encode()).hexdigest()[:16])
-    baseline.run(run, capture, config, console, lpips_weights=lpips_weights)
+    baseline.run(run, capture, config, console, lpips_weights=lpips_weights, device=device)

@@ -23,7 +23,7 @@ from rich.console import Console
 
 from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
 from experiments.bench.claim_check import check_claims
-from experiments.bench.definitions import BenchScene, has_block_folders, has_gaussian_blocks
+from experiments.bench.definitions import RECORD_FILE, BenchScene, has_block_folders, has_gaussian_blocks
 from experiments.bench.equal_time import step_factors
 from experiments.bench.figure import plot_visibility_groups
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
@@ -39,7 +39,7 @@ from experiments.bench.renders import check_renders
 from experiments.bench.result_tables import make_result_tables
 from experiments.bench.results import BenchResult, collect_results, results_to_json
 from experiments.bench.table_writers import to_latex, to_markdown, to_tidy_csv
-from experiments.bench.worker import RECORD_FILE, BenchJob
+from experiments.bench.worker import BenchJob
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import check_not_among_files, check_output
 from vdgs.config.capture_options import CaptureOptions
@@ -72,6 +72,8 @@ class BenchSettings:
     reuse_results: tuple[Path, ...] = ()
     #: Afterwards once more, each method with as many iterations as fit into the time of the table's own method.
     equal_time: bool = False
+    #: Where runs are trained and measured, selected already.
+    device: str = "cpu"
 
 
 def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
@@ -268,7 +270,7 @@ def _job(run: PlannedRun, plan: BenchPlan, capture: Path, key: str, settings: Be
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(), key,
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.visibility_bins, threads,
         threads if settings.jobs == 1 else 1, settings.overwrite,
-        run.renders and run.renders.resolve(),
+        run.renders and run.renders.resolve(), settings.device,
     )  # fmt: skip
 
 

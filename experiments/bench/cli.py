@@ -13,8 +13,8 @@ from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, FlagName, Positional, Range
 
 TableName = Literal[
-    "table1", "table2", "table3", "table3-each", "table4", "factorial", "crossed", "coarse-compensation",
-    "more-anchors", "efficiency", "longer", "choices", "toy",
+    "table1", "table2", "table3", "table3-each", "table4", "factorial", "crossed", "paper-blocks",
+    "coarse-compensation", "more-anchors", "efficiency", "longer", "choices", "toy",
 ]  # fmt: skip
 
 
@@ -28,13 +28,15 @@ class BenchArguments:
     table: Annotated[TableName, Positional()]
     """What to measure. table1 to table4: those of the paper; table3-each, factorial, coarse-compensation, more-anchors:
     where its premise holds, each block trained as long, its choices crossed, its compensation without blocks, and its
-    parts against plain growth at lower thresholds; crossed: the cut and compensation in the preset `paper`; efficiency:
-    its paragraph; longer: blocks that train two and four times as long; choices: one choice of ours changed at a time;
-    toy: a small one in a minute or two."""
+    parts against plain growth at lower thresholds; crossed: the cut and compensation in the preset `paper`;
+    paper-blocks: tables 2 and 3 in it, each block trained as long; efficiency: its paragraph; longer: blocks that train
+    two and four times as long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
     output: Annotated[Path, Output()]
     """Folder for runs and results; new, or the one to continue."""
     seeds: Annotated[int | None, Range(1, 1000)] = None
     """How many seeds (0, 1, ...); by default as many as the table has."""
+    first_seed: Annotated[int, Range(0, MAX_COUNT)] = 0
+    """The first of them, where other machines make those before it (--reuse-results puts them into one table)."""
     scenes: tuple[str, ...] = ()
     """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ... Or captures of
     your own, as folders: ./my-place. What says how a capture is read (--images, --downscale and on) is about these."""
@@ -59,6 +61,8 @@ class BenchArguments:
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
     jobs: Annotated[int, Range(1, 1024)] = 1
     """Runs at once; cores are shared among them."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. On a card the blocks of a run are trained one after another."""
     overwrite: bool = False
     """Let other settings discard what was trained with the old ones."""
     lpips_weights: Path | None = None
@@ -75,10 +79,12 @@ def bench_command(arguments: list[str]) -> None:
     args = parse_arguments(BenchArguments, arguments, "bench")
     from experiments.bench.bench import BenchSettings, run_bench
     from experiments.bench.plan import PlanOptions
+    from vdgs.kernels.device_selection import select_device
 
     options = PlanOptions(
         args.seeds, args.scenes, args.methods, args.steps_scaler, args.total_iterations, args.max_anchors,
         args.options.validation, args.renders, replace(args.options, validation=False),
+        first_seed=args.first_seed,
     )  # fmt: skip
     run_bench(
         BenchSettings(
@@ -92,6 +98,7 @@ def bench_command(arguments: list[str]) -> None:
             args.overwrite,
             args.reuse_results,
             args.equal == "time",
+            select_device(args.device).device,
         ),
         make_console(args.quiet),
     )

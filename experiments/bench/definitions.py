@@ -10,6 +10,8 @@ from typing import Any
 from vdgs.config.method import DensifyConfig, MethodConfig, TrainConfig
 from vdgs.config.presets import PRESETS, PresetName
 
+#: In the run folder: state, key, provenance, seconds of each stage.
+RECORD_FILE = "bench.json"
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
 COARSE_STAGES = ("coarse", "evaluate")
 BLOCK_STAGES = ("coarse", "partition", "blocks", "merge", "evaluate")

@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from experiments.bench.pixel_visibility import PixelVisibility
-from experiments.bench.worker import RECORD_FILE
+from experiments.bench.definitions import RECORD_FILE
+from experiments.bench.pixel_visibility import PixelVisibility, visibility_from_frusta, visibility_from_truth
 from vdgs.captures.image_cache import ImageCache
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
@@ -69,6 +70,14 @@ def measure_groups(
     for folder in to_measure:
         groups = {"groups": histograms[folder].bins(bins), "unseen_share": unseen / max(pixels, 1)}
         write_json(folder / file, to_jsonable(records[folder] | groups))
+
+
+def measure_by_truth(root: Path, options: CaptureOptions, run: Path, key: str, bins: int) -> None:
+    """Measure one run of a generated scene by its truth, which waits for no other run; nothing without truth."""
+    for find in (visibility_from_truth, visibility_from_frusta):
+        visibility = find(root, options)
+        if visibility is not None:
+            measure_groups(visibility, {run: key}, bins, lambda text: None)
 
 
 def pixel_values(

@@ -25,6 +25,7 @@ from experiments.bench.overrides import (
     disable_compensation,
     factorial_cell,
     full_method,
+    in_preset_paper,
     with_assignment,
     with_beta_g,
     with_block,
@@ -302,6 +303,31 @@ _CROSSED = [
     for compensated in (False, True)
 ]
 
+#: Beside the cells above with λ_vis = 1, which have four blocks.
+_PAPER_BLOCKS = [
+    BenchMethod(
+        "paper-coarse", "preset paper, coarse stage", in_preset_paper(full_method), COARSE_STAGES,
+        less="iterations of the coarse stage only",
+    ),
+    BenchMethod(
+        "paper-coarse-as-long", "preset paper, coarse stage, as long as one block",
+        in_preset_paper(coarse_same_iterations), COARSE_STAGES, less="iterations of the coarse stage and one block",
+    ),
+    BenchMethod(
+        "paper-baseline", "preset paper, coarse stage, as long as four blocks", in_preset_paper(coarse_only),
+        COARSE_STAGES,
+    ),
+    *(
+        BenchMethod(
+            f"paper-blocks-{count}", f"preset paper, {count} block{'s' * (count > 1)}, each as long as one of four",
+            in_preset_paper(with_more_blocks(count / 4)),
+            less=f"iterations: of {count} of four blocks" if count < 4 else "",
+            more=f"iterations: of {count} blocks, not four" if count > 4 else "",
+        )
+        for count in (1, 2, 8)
+    ),
+]  # fmt: skip
+
 #: The cells of the preset `paper`.
 CROSSED = tuple(method.name for method in _CROSSED)
 #: The cells of the factorial.
@@ -311,7 +337,7 @@ METHODS: dict[str, BenchMethod] = {
     method.name: method
     for group in (
         _ABLATIONS, OTHER_METHODS, BLOCK_METHODS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _COARSE_PARTS, _LONGER,
-        _CHOICES, _SWEEPS, _FACTORIAL, _CROSSED, _EAGER,
+        _CHOICES, _SWEEPS, _FACTORIAL, _CROSSED, _PAPER_BLOCKS, _EAGER,
     )
     for method in group
 }  # fmt: skip

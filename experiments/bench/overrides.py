@@ -103,14 +103,15 @@ def as_preset(name: PresetName) -> ConfigOverride:
     return change
 
 
+def in_preset_paper(change: ConfigOverride) -> ConfigOverride:
+    """A change of the preset `paper`."""
+    return lambda config, budget: change(as_preset("paper")(config, budget), budget)
+
+
 def crossed_cell(lambda_vis: float, compensated: bool) -> ConfigOverride:
     """The preset `paper`, cut by visibility or by place alone, grown with compensation or plainly."""
-
-    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        cut = with_lambda_vis(lambda_vis)(as_preset("paper")(config, budget), budget)
-        return enable_compensation(cut, enabled=compensated)
-
-    return change
+    cut = in_preset_paper(with_lambda_vis(lambda_vis))
+    return lambda config, budget: enable_compensation(cut(config, budget), enabled=compensated)
 
 
 def with_paper_compensation(config: MethodConfig, **values: float) -> MethodConfig:

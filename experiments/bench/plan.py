@@ -47,6 +47,8 @@ class PlanOptions:
     options: CaptureOptions = field(default_factory=CaptureOptions)
     #: (scene, method, factor): what the iterations of a method on a scene are multiplied by (`equal_time.py`).
     step_factors: tuple[tuple[str, str, float], ...] = ()
+    #: What every seed is moved by: another machine makes others of the same table.
+    first_seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     scenes = resolve_scenes(options.scenes or table.scenes, options.options, options.validation)
     methods = tuple(_method(each) for each in options.methods or table.methods)
     seeds = table.seeds if options.seeds is None else tuple(range(options.seeds))
+    seeds = tuple(options.first_seed + seed for seed in seeds)
     factors = {(scene, method): factor for scene, method, factor in options.step_factors}
     if not seeds:
         raise VdgsError("--seeds must be at least 1")

@@ -13,11 +13,18 @@ from vdgs.runs.config_file import git_commit
 _CPUINFO_FILE = Path("/proc/cpuinfo")
 
 
-def describe_provenance(threads: int) -> str:
+def describe_provenance(threads: int, device: str = "cpu") -> str:
     """This day and machine, and the commit (outside a checkout: the version) of this package."""
     of = sha[:7] if (sha := git_commit()) else __version__
     cores = f"{threads} thread{'s' * (threads > 1)}"
-    return f"{date.today().isoformat()}, {cores} of {_processor()} ({cpu_instruction_set()}), {of}"
+    card = "" if device == "cpu" else f"{_card(device)}, "
+    return f"{date.today().isoformat()}, {card}{cores} of {_processor()} ({cpu_instruction_set()}), {of}"
+
+
+def _card(device: str) -> str:
+    import torch
+
+    return torch.cuda.get_device_name(device)
 
 
 def _processor() -> str:

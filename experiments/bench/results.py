@@ -10,10 +10,9 @@ from typing import Any
 from experiments.baselines.gaussian_blocks.cut import GaussianCut
 from experiments.baselines.gaussian_blocks.training import block_statuses
 from experiments.bench.baseline_stages import baseline_folder
-from experiments.bench.definitions import has_block_folders, has_gaussian_blocks
+from experiments.bench.definitions import RECORD_FILE, has_block_folders, has_gaussian_blocks
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, final_evaluation_folder
 from experiments.bench.plan import BenchPlan, PlannedRun
-from experiments.bench.worker import RECORD_FILE
 from vdgs.distributed.executor import TaskResult
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder

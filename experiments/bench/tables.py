@@ -131,6 +131,22 @@ TABLES: dict[str, BenchTable] = {
             ours="paper-1-on",
         ),
         BenchTable(
+            "paper-blocks",
+            "Tables II and III in the preset paper, each block trained as long",
+            (
+                "paper-coarse",
+                "paper-coarse-as-long",
+                "paper-baseline",
+                "paper-blocks-1",
+                "paper-blocks-2",
+                "paper-1-off",
+                "paper-1-on",
+                "paper-blocks-8",
+            ),
+            ("regime-small",),
+            ours="paper-1-on",
+        ),
+        BenchTable(
             "coarse-compensation",
             "Compensation in the coarse stage alone",
             ("coarse", "coarse-compensated-mean", "coarse-compensated-sum"),

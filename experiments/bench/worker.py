@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.bench.definitions import RECORD_FILE
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
 from vdgs.config.serialization import from_dict
@@ -23,9 +24,6 @@ from vdgs.system.atomic_files import read_json, write_json
 
 if TYPE_CHECKING:
     from vdgs.runs.run_context import RunContext
-
-#: In the run folder: state, key, provenance, seconds of each stage.
-RECORD_FILE = "bench.json"
 
 
 @dataclass(frozen=True)
@@ -45,6 +43,7 @@ class BenchJob:
     block_jobs: int
     overwrite: bool = False
     renders: Path | None = None
+    device: str = "cpu"
 
     def write(self, path: Path) -> None:
         write_json(path, {name: _plain(value) for name, value in vars(self).items()})
@@ -72,7 +71,7 @@ def _coarse(at: _JobContext) -> None:
 
     if at.job.coarse_from is not None:
         link_coarse_stage(at.job.coarse_from, at.job.output)
-    train_coarse(at.context, CheckpointOptions(), at.console)
+    train_coarse(at.context, CheckpointOptions(), at.console, at.job.device)
 
 
 def _partition(at: _JobContext) -> None:
@@ -80,20 +79,27 @@ def _partition(at: _JobContext) -> None:
     from vdgs.pipeline.partition_stage import partition_run
 
     count_run_visibility(at.context, at.console)
-    partition_run(at.context, at.console)
+    partition_run(at.context, at.console, at.job.device)
 
 
 def _blocks(at: _JobContext) -> None:
     from vdgs.config.executor_options import CheckpointOptions
+    from vdgs.pipeline.train_block import train_block
     from vdgs.pipeline.train_blocks import train_blocks
+    from vdgs.runs.open_run import load_run_blocks
 
-    train_blocks(at.context, CheckpointOptions(), at.job.block_jobs, at.console)
+    if at.job.device == "cpu":
+        train_blocks(at.context, CheckpointOptions(), at.job.block_jobs, at.console)
+        return
+    # In this process: loading torch and its kernels for each block would take longer than many blocks of a table.
+    for index in range(len(load_run_blocks(at.context.run))):
+        train_block(at.context, index, CheckpointOptions(), at.console, at.job.device)
 
 
 def _momentum(at: _JobContext) -> None:
     from experiments.baselines.momentum_gs.run import train_momentum_blocks
 
-    train_momentum_blocks(at.context, at.console)
+    train_momentum_blocks(at.context, at.console, device=at.job.device)
 
 
 def _merge(at: _JobContext) -> None:
@@ -112,6 +118,7 @@ def _evaluate(at: _JobContext) -> None:
             which="best",
             lpips_weights=at.job.lpips_weights,
             visibility_bins=at.job.visibility_bins,
+            device=at.job.device,
         ),
         at.console,
     )
@@ -139,7 +146,9 @@ def _stage(name: str) -> Callable[[_JobContext], None]:
         return STAGES[name]
     from experiments.bench.baseline_stages import train_baseline
 
-    return lambda at: train_baseline(name, at.context.run, at.context.capture, at.job.lpips_weights, at.console)
+    return lambda at: train_baseline(
+        name, at.context.run, at.context.capture, at.job.lpips_weights, at.console, at.job.device
+    )
 
 
 def link_coarse_stage(source: Path, target: Path) -> None:
@@ -174,6 +183,7 @@ def run_job(job: BenchJob) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
     from rich.console import Console
 
+    from experiments.bench.measure import measure_by_truth
     from experiments.bench.provenance import describe_provenance
     from vdgs.kernels import configure_threads
 
@@ -187,7 +197,13 @@ def run_job(job: BenchJob) -> None:
             _stage(name)(working)
             record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
             write_json(job.output / RECORD_FILE, record)
-        write_json(job.output / RECORD_FILE, record | {"state": "done", "provenance": describe_provenance(job.threads)})
+        if job.stages != ("coarse",):  # one that several runs share is not measured
+            options: CaptureOptions = from_dict(CaptureOptions, job.options, "capture")
+            measure_by_truth(job.capture, options, job.output, job.key, job.visibility_bins)
+        write_json(
+            job.output / RECORD_FILE,
+            record | {"state": "done", "provenance": describe_provenance(job.threads, job.device)},
+        )
 
 
 @contextmanager

@@ -41,7 +41,7 @@ def there(data, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("known") / "there"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
-        patch.setattr("experiments.bench.provenance.describe_provenance", lambda threads: "1999-12-31, another machine")
+        patch.setattr("experiments.bench.provenance.describe_provenance", lambda *_: "1999-12-31, another machine")
         bench(asked(data, output))
     return output / "table2" / "results.json"
 

@@ -123,6 +123,9 @@ def test_crossed_cells_differ_from_the_preset_paper_in_the_two_factors_alone():
     whole = to_dict(settings["vdgs-paper"])
     for name, lines in (("0-on", [by_place]), ("1-off", [plain]), ("0-off", [by_place, plain])):
         assert sorted(diff_settings(whole, to_dict(settings[f"paper-{name}"]))) == sorted(lines)
+    for count in (1, 2, 8):  # each block as long as one of four
+        blocks = METHODS[f"paper-blocks-{count}"].settings(base, scene.budget)
+        assert diff_settings(whole, to_dict(blocks)) == [f"partition.blocks: 4 -> {count}"]
 
 
 def test_short_training_decides_about_growth_and_long_training_as_often_as_its_preset():
@@ -201,7 +204,7 @@ def test_comparators_that_published_dense_adam_have_it():
     assert baseline.training.optimizer == "sparse-adam"
     merged = {name: METHODS[name].settings(base, scene.budget).merge.rule for name in METHODS}
     assert {name for name, rule in merged.items() if rule == "max-visibility"} == {
-        "free-best-seen", "ramp-best-seen", "vdgs-paper", *TABLES["crossed"].methods
+        "free-best-seen", "ramp-best-seen", "vdgs-paper", *TABLES["crossed"].methods, *TABLES["paper-blocks"].methods
     }  # fmt: skip
 
 
@@ -255,6 +258,7 @@ def test_choices_change_the_budget_for_all_alike():
     plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, total_iterations=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)
     assert plan.seeds == (0, 1)
+    assert make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, first_seed=1)).seeds == (1, 2)
     full = plan.run_of["tiny", "full", 1].config
     # Growth starts later in proportion, as block.steps_scaler does it.
     assert (full.training.densify.start, full.block.densify.start) == (200, 100)

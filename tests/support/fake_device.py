@@ -154,7 +154,7 @@ class Told(TorchFunctionMode):
         if func is Tensor.numpy and self.memory.holds(args[0]):
             raise TypeError("can't convert a cuda tensor to numpy: use cpu() first")
         if func is Tensor.cpu:
-            return args[0].detach().clone() if not self.memory.holds(args[0]) else self._copied(args[0], None)
+            return self._copied(args[0], None) if self.memory.holds(args[0]) else args[0]
         if func is Tensor.to:
             return self._to(*args, **kwargs)
         if func is Tensor.new_tensor:

@@ -24,9 +24,11 @@ def train_citygaussian(scene: BlockScene) -> Gaussians:
     """The merged scene. Raises what `train_gs3d` and `run_session` raise."""
     config = scene.config
     coarse = train_gs3d(
-        scene.capture, config.scene, scene.folder.path / "coarse", scene.console, options=scene.options
-    ).gaussians
-    cut = scene.cut(lambda: cut_by_removal("citygaussian", coarse, scene.cameras, config.blocks, config.image_size))
+        scene.capture, config.scene, scene.folder.path / "coarse", scene.console, options=scene.options,
+        device=scene.device,
+    ).gaussians  # fmt: skip
+    drawn = coarse.to(scene.device)
+    cut = scene.cut(lambda: cut_by_removal("citygaussian", drawn, scene.cameras, config.blocks, config.image_size))
     owner = cut.blocks.owner(xy_positions(coarse.means))
     parts = []
     for index, views in enumerate(cut.views):

@@ -88,6 +88,12 @@ class Consensus:
         ]
         return Consensus(config, members, gaussians, rho, dict(rho), duals)
 
+    def move_to(self, device: str) -> None:
+        """Go on on a device."""
+        self.gaussians = self.gaussians.to(device)
+        self.members = [BlockMembers(each.rows.to(device), each.shared.to(device)) for each in self.members]
+        self.duals = [{name: tensor.to(device) for name, tensor in each.items()} for each in self.duals]
+
     def pull(self, index: int, copies: Gaussians) -> dict[str, Tensor]:
         """The gradient of the penalty of a block by its copies: rho (x + u - z) where they are shared, else 0."""
         each, pulled = self.members[index], {}
@@ -134,7 +140,7 @@ def mean_gaussians(before: Gaussians, copies: Sequence[Gaussians], members: Sequ
     that none holds stays."""
     means = {}
     for name, tensor in before.tensors().items():
-        mean, total, count = tensor.clone(), torch.zeros_like(tensor), torch.zeros(len(tensor))
+        mean, total, count = tensor.clone(), torch.zeros_like(tensor), tensor.new_zeros(len(tensor))
         for copy, each in zip(copies, members, strict=True):
             x = copy.tensors()[name]
             mean[each.rows] = x

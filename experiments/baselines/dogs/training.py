@@ -60,12 +60,13 @@ def train_dogs(scene: BlockScene, config: ConsensusConfig | None = None) -> Gaus
         folder, len(problems) * scene.config.iterations, start,
         lambda saved: restore(saved, list(problems.values()), config), "Choose another output folder.", scene.console,
     )  # fmt: skip
+    training.move_to(scene.device)
     train_in_turns(folder, training, scene.options, scene.console)
     for index, state in zip(problems, training.states, strict=True):
         stage = scene.block_folder(index)
         status = replace(stage.status(), iteration=state.iteration, iterations=state.iteration, seconds=state.seconds)
         stage.set_status(replace(status, peak_memory_bytes=training.peak_memory_bytes))
-    return training.consensus.gaussians
+    return training.consensus.gaussians.to("cpu")
 
 
 def _grow(scene: BlockScene, cut: GaussianCut) -> dict[int, Gs3dProblem]:
@@ -111,6 +112,11 @@ class DogsTraining(JointTraining):
             for k, each in enumerate(problems)
         ]
 
+    def move_to(self, device: str) -> None:
+        """Go on on a device."""
+        self.blocks = self.states = [state.to(device) for state in self.states]
+        self.consensus.move_to(device)
+
     def step(self, index: int) -> None:
         gs3d_train_step(self.states[index], self._problems[index])
 
@@ -126,7 +132,9 @@ class DogsTraining(JointTraining):
         agreed = self.consensus
         tensors = {f"z.{name}": tensor for name, tensor in agreed.gaussians.tensors().items()}
         for k, (members, duals) in enumerate(zip(agreed.members, agreed.duals, strict=True)):
-            held = torch.zeros(len(agreed.gaussians), dtype=torch.bool).index_fill_(0, members.rows, True)
+            held = torch.zeros_like(agreed.gaussians.opacity_logits, dtype=torch.bool).index_fill_(
+                0, members.rows, True
+            )
             tensors |= {f"held.{k}": held, **{f"dual.{k}.{name}": tensor for name, tensor in duals.items()}}
         return {"rho": agreed.rho, "first_rho": dict(agreed.first_rho), "begun": self._begun}, tensors
 

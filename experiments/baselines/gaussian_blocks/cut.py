@@ -75,8 +75,8 @@ def cut_by_removal(
     strategy: str, gaussians: Gaussians, cameras: Sequence[Camera], count: int, image_size: int
 ) -> GaussianCut:
     """The cut of a strategy that asks what a trained scene looks like without a block: 1 - SSIM is its score. Pictures
-    are at most `image_size` wide and high."""
-    points = gaussians.means.numpy()
+    are at most `image_size` wide and high, drawn on the device of the Gaussians."""
+    points = gaussians.means.cpu().numpy()
     blocks, warnings = STRATEGIES[strategy].partition(points, cameras, count)
     owner = blocks.owner(xy_positions(points))
     held = points_held(points, owner, len(blocks), cameras)
@@ -94,7 +94,7 @@ def points_held(
 
 def holds(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:
     """Which points lie in the frustum of a camera."""
-    held: np.ndarray = get_backend(points.device).mark_visible(points, camera).numpy()
+    held: np.ndarray = get_backend(points.device).mark_visible(points, camera).cpu().numpy()
     return held
 
 
@@ -105,10 +105,11 @@ def _removal_scores(
     """1 - SSIM of a view, over black, without the Gaussians of each block against the whole view."""
     small = camera.limit_size(image_size)
     rows = visible_gaussian_rows(gaussians, small)
-    seen, of_block, black = gaussians.select(rows), torch.from_numpy(owner)[rows], torch.zeros(3)
+    seen, of_block = gaussians.select(rows), torch.from_numpy(owner).to(rows.device)[rows]
+    black = seen.means.new_zeros(3)
 
     def picture(shown: Gaussians) -> Tensor:
-        return render_gaussians(shown, small, black, shown.sh_degree)[0].image
+        return render_gaussians(shown, small, black, shown.sh_degree)[0].image.cpu()
 
     full, scores = picture(seen), np.zeros(count)
     for block in of_block.unique().tolist():

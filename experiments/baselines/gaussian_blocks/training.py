@@ -73,6 +73,8 @@ class BlockScene:
     folder: StageFolder
     options: CheckpointOptions
     console: Console
+    #: Where blocks are trained; what is kept of them is in main memory.
+    device: str = "cpu"
 
     @property
     def cameras(self) -> list[Camera]:
@@ -112,10 +114,11 @@ class BlockScene:
         self.console.print(
             f"block {index}: {problem.image_count} training views, {problem.end:,} iterations", highlight=False
         )
-        state = resume_or_start(folder, problem.end, start, self.console)
+        state = resume_or_start(folder, problem.end, start, self.console, self.device)
         train_with_checkpoints(folder, state, problem, self.options, self.console)
-        finish_training(folder, state, self.model(state.gaussians), self.console)
-        return state.gaussians
+        trained = state.gaussians.to("cpu")
+        finish_training(folder, state, self.model(trained), self.console)
+        return trained
 
     def keep(self, index: int, gaussians: Gaussians, reason: str) -> Gaussians:
         """A block that cannot be trained stays as it is."""
@@ -137,8 +140,9 @@ def train_scene(
     method: Callable[[BlockScene], Gaussians],
     console: Console,
     options: CheckpointOptions | None = None,
+    device: str = "cpu",
 ) -> GaussianModel:
-    """Train, or continue, a scene by a method; if it is finished, only read the model."""
+    """Train, or continue, a scene by a method, on a device; if it is finished, only read the model."""
     if folder.is_done():
         console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
         return GaussianModel.load(folder.model)
@@ -151,7 +155,7 @@ def train_scene(
             background = mean_image_color(images, len(views), factors[-1])
         scene = BlockScene(
             capture=capture, config=config, images=images, background=background, folder=folder, options=options,
-            console=console,
+            console=console, device=device,
         )  # fmt: skip
         model = scene.model(method(scene))
     model.save(folder.model)

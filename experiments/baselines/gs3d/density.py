@@ -90,8 +90,9 @@ def adaptive_density_control(
 def split_gaussians(parents: Gaussians, shrink: float, generator: torch.Generator) -> Gaussians:
     """SPLIT_COUNT parts for each of p parents, all first parts before all second ones: their means are drawn from the
     parent's own distribution, their scales divided by `shrink`, everything else is the parent's."""
-    parts = parents.select(torch.arange(len(parents)).repeat(SPLIT_COUNT))
-    along_axes = torch.randn(len(parts), 3, generator=generator) * parts.log_scales.exp()
+    parts = parents.select(torch.arange(len(parents), device=parents.means.device).repeat(SPLIT_COUNT))
+    # Drawn on the CPU: the same numbers for any device.
+    along_axes = torch.randn(len(parts), 3, generator=generator).to(parts.means) * parts.log_scales.exp()
     moved = (rotation_matrices(parts.quaternions) @ along_axes[:, :, None])[:, :, 0]
     return replace(parts, means=parts.means + moved, log_scales=parts.log_scales - math.log(shrink))
 

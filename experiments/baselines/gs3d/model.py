@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,11 +64,16 @@ class GaussianModel:
     #: JSON values that travel with the file: ground frame, capture, version.
     metadata: Mapping[str, Any]
 
+    def to(self, device: str) -> GaussianModel:
+        """The same model on a device."""
+        return replace(self, gaussians=self.gaussians.to(device))
+
     @torch.no_grad()
     def render(self, camera: Camera, *, depth: bool = False) -> Raster:
         """One view: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None."""
         seen = self.gaussians.select(visible_gaussian_rows(self.gaussians, camera))
-        return render_gaussians(seen, camera, torch.tensor(self.background), seen.sh_degree, depth)[0]
+        behind = seen.means.new_tensor(self.background)
+        return render_gaussians(seen, camera, behind, seen.sh_degree, depth)[0]
 
     def splats(self, camera: Camera) -> Splats:
         """What a view is drawn from."""

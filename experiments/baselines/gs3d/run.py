@@ -71,6 +71,7 @@ def run_gs3d(
     options: CheckpointOptions | None = None,
     visibility_map: VisibilityMap | None = None,
     lpips_weights: Path | None = None,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Train (or continue) in RUN/gaussians and measure into RUN/evaluation. Returns what metrics.json holds.
 
@@ -78,10 +79,10 @@ def run_gs3d(
     """
     folder = gaussians_folder(run)
     with run.locked():
-        model = train_gs3d(capture, config, folder.path, console, options=options)
+        model = train_gs3d(capture, config, folder.path, console, options=options, device=device)
         write_json(run.capture_file, capture_metadata(capture))
     return evaluate_gs3d(
-        model, capture, run.evaluation, console,
+        model.to(device), capture, run.evaluation, console,
         visibility_map=visibility_map, lpips_weights=lpips_weights, trained=folder,
     )  # fmt: skip
 
@@ -93,8 +94,10 @@ def train_gs3d(
     console: Console,
     *,
     options: CheckpointOptions | None = None,
+    device: str = "cpu",
 ) -> GaussianModel:
-    """Train, or continue, 3DGS on the training views of a capture; if it is finished, only read the model.
+    """Train, or continue, 3DGS on the training views of a capture, on a device; if it is finished, only read the model,
+    which is in main memory in any case.
 
     Raises VdgsError for settings that do not work, RunError where `output` holds another run, CaptureError for a
     capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved),
@@ -116,10 +119,11 @@ def train_gs3d(
             if config.background == "mean":
                 background = mean_image_color(images, len(views), factors[-1])
             stage = Gs3dProblem(config, images, len(views), extent, background)
-            state = resume_or_start(folder, config.iterations, lambda: state_from_points(capture, config), console)
+            start = lambda: state_from_points(capture, config)  # noqa: E731
+            state = resume_or_start(folder, config.iterations, start, console, device)
             train_with_checkpoints(folder, state, stage, options, console)
         metadata = {"capture": capture_metadata(capture), "version": __version__, "iterations": state.iteration}
-        model = GaussianModel(state.gaussians, stage.background, metadata)
+        model = GaussianModel(state.gaussians.to("cpu"), stage.background, metadata)
         finish_training(folder, state, model, console)
         return model
 
@@ -136,7 +140,8 @@ def evaluate_gs3d(
     settings: EvaluationSettings | None = None,
     method: str = METHOD_NAME,
 ) -> dict[str, Any]:
-    """Measure a model on the test views; writes the evaluation folder `output` and returns what metrics.json holds.
+    """Measure a model on the test views, on its device; writes the evaluation folder `output` and returns what
+    metrics.json holds.
 
     `visibility_map(camera)` is V per pixel, drawn with one model for all methods that are compared; without it there
     are no figures by visibility. `trained` is where the model was trained, for its size, time and memory. Raises

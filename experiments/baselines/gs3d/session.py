@@ -35,13 +35,14 @@ from vdgs.training.session.training_session import Checkpointer, TrainingSession
 
 
 def resume_or_start(
-    folder: StageFolder, iterations: int, start: Callable[[], Gs3dState], console: Console
+    folder: StageFolder, iterations: int, start: Callable[[], Gs3dState], console: Console, device: str = "cpu"
 ) -> Gs3dState:
-    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one, on a device; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read.
     """
-    return restore_or_start(folder, iterations, start, from_checkpoint, "Choose another output folder.", console)
+    advice = "Choose another output folder."
+    return restore_or_start(folder, iterations, start, from_checkpoint, advice, console).to(device)
 
 
 def state_from_points(capture: Capture, config: Gs3dConfig, rows: Tensor | None = None) -> Gs3dState:

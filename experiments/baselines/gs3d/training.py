@@ -19,6 +19,7 @@ from vdgs.errors import TrainingDiverged
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import AdamState, IsFinite, PhotometricLoss
+from vdgs.kernels.transfer import upload
 from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training import PSNR_LOG_INTERVAL, TrainingImages, view_at
@@ -141,6 +142,18 @@ class Gs3dState:
     #: What an `ImageLoss` trains besides.
     extra: dict[str, Tensor] = field(default_factory=dict)
 
+    def to(self, device: torch.device | str) -> Gs3dState:
+        """The same state on a device: photographs come to where it is."""
+
+        def there(group: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: tensor.to(device) for name, tensor in group.items()}
+
+        moments = AdamMoments(there(self.moments.first), there(self.moments.second))
+        return replace(
+            self, gaussians=self.gaussians.to(device), moments=moments, gradient=self.gradient.to(device),
+            views=self.views.to(device), scratch={}, extra=there(self.extra),
+        )  # fmt: skip
+
     def take_groups(self) -> dict[str, TensorGroup]:
         """What is kept per Gaussian and outlives a decision, no longer held here: see
         `per_anchor_tensors.index_anchors`."""
@@ -175,8 +188,8 @@ def scene_extent(cameras: list[Camera]) -> float:
 
 def initial_state(gaussians: Gaussians) -> Gs3dState:
     """A state before the first step. The tensors are moved in place: give copies of what must stay."""
-    n = len(gaussians)
-    return Gs3dState(0, gaussians, AdamMoments.zeros(gaussians.tensors()), torch.zeros(n), torch.zeros(n))
+    zeros = torch.zeros_like(gaussians.opacity_logits)
+    return Gs3dState(0, gaussians, AdamMoments.zeros(gaussians.tensors()), zeros, zeros.clone())
 
 
 def sh_degree_at(iteration: int, config: Gs3dConfig) -> int:
@@ -204,7 +217,7 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     config, iteration = stage.config, state.iteration
     downscale, degree = downscale_at(iteration, config), stage.sh_degree_at(iteration)
     view = view_at(iteration, stage.image_count, config.seed)
-    target, mask = stage.images.get(view, downscale)
+    target, mask = photograph(stage, view, downscale, state.gaussians.means.device)
     camera = stage.images.camera(view, downscale)
 
     rows = visible_gaussian_rows(state.gaussians, camera)
@@ -235,6 +248,12 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     _smooth(state, value, psnr)
     state.is_consistent = True
     return report
+
+
+def photograph(stage: Gs3dProblem, view: int, downscale: int, device: torch.device) -> tuple[Tensor, Tensor | None]:
+    """A training view and its mask, on a device."""
+    image, mask = stage.images.get(view, downscale)
+    return upload(image, device), None if mask is None else upload(mask, device)
 
 
 def _compare(
@@ -312,7 +331,8 @@ def _apply(state: Gs3dState, added: Gaussians, kept: Tensor) -> None:
     """Append Gaussians without moments, then keep some of all; the statistics begin again."""
     state.scratch = {}
     index_anchors(state, {"gaussians": added.tensors()}, len(added), kept)
-    state.gradient, state.views = torch.zeros(len(state.gaussians)), torch.zeros(len(state.gaussians))
+    state.gradient = torch.zeros_like(state.gaussians.opacity_logits)
+    state.views = torch.zeros_like(state.gradient)
 
 
 def _smooth(state: Gs3dState, loss: float, psnr: float | None) -> None:

@@ -84,22 +84,28 @@ def levels_at(config: HugConfig, octree: Octree) -> Callable[[int], int]:
 
 
 def run_hug(
-    run: RunFolder, capture: Capture, config: HugConfig, console: Console, *, lpips_weights: Path | None = None
+    run: RunFolder,
+    capture: Capture,
+    config: HugConfig,
+    console: Console,
+    *,
+    lpips_weights: Path | None = None,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Train (or continue) in RUN/hug and measure into RUN/evaluation. Raises what `run_octree` raises, and VdgsError
     where a block has no photograph."""
     folder = StageFolder(run.path / "hug")
     with run.locked():
-        model = _train(capture, config, folder, console)
+        model = _train(capture, config, folder, console, device)
         write_json(run.capture_file, capture_metadata(capture))
     facts = BaselineFacts(
         name="hug", capture=dict(model.anchors.metadata.capture or {}), trained=folder,
         num_anchors=len(model.anchors.anchors),
     )  # fmt: skip
-    return evaluate_baseline(model, facts, capture, run.evaluation, console, lpips_weights=lpips_weights)
+    return evaluate_baseline(model.to(device), facts, capture, run.evaluation, console, lpips_weights=lpips_weights)
 
 
-def _train(capture: Capture, config: HugConfig, folder: StageFolder, console: Console) -> OctreeModel:
+def _train(capture: Capture, config: HugConfig, folder: StageFolder, console: Console, device: str) -> OctreeModel:
     with folder.locked():
         if folder.is_done():
             console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
@@ -117,7 +123,8 @@ def _train(capture: Capture, config: HugConfig, folder: StageFolder, console: Co
             own = [owners[i] == block for i in chosen]
             stage = StageFolder(folder.path / f"block-{block}")
             stage.path.mkdir(exist_ok=True)
-            models.append(_train_block(capture, config, boxes, block, [views[i] for i in chosen], own, stage, console))
+            shown = [views[i] for i in chosen]
+            models.append(_train_block(capture, config, boxes, block, shown, own, stage, console, device))
             statuses.append(stage.status())
             counts.append(len(chosen))
         merged = merge(models, boxes, ModelMetadata(capture=capture_metadata(capture), version=__version__))
@@ -128,7 +135,7 @@ def _train(capture: Capture, config: HugConfig, folder: StageFolder, console: Co
 
 def _train_block(
     capture: Capture, config: HugConfig, boxes: GroundBoxes, block: int, views: Sequence[View],
-    own: Sequence[Bool[np.ndarray, "_h _w"]], folder: StageFolder, console: Console,
+    own: Sequence[Bool[np.ndarray, "_h _w"]], folder: StageFolder, console: Console, device: str,
 ) -> OctreeModel:  # fmt: skip
     """The model of a block, in its widened box."""
     if folder.is_done():
@@ -142,7 +149,7 @@ def _train_block(
     octree = fit_octree(points, cameras, config.octree)
     with ImageCache(views, image_cache_bytes(CheckpointOptions())) as images:
         problem = octree_problem(
-            capture, config.octree, octree, MaskedImages(images, own), cameras, levels_at(config, octree)
+            capture, config.octree, octree, MaskedImages(images, own), cameras, levels_at(config, octree), device
         )
         problem = replace(problem, growth_mask=within if len(boxes) > 1 else None)
         start = lambda: octree_state(points, cameras, problem, octree)  # noqa: E731

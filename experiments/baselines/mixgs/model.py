@@ -83,17 +83,20 @@ def encode_places(places: Float[Tensor, "v 3"], table: Float[Tensor, "lt f"], sc
     at = inside[:, None, :] * resolutions[:, None]
     base = at.floor()
     share = (at - base)[:, :, None, :]
-    corners = torch.tensor([[i >> axis & 1 for axis in range(3)] for i in range(8)])
+    corners = torch.tensor([[i >> axis & 1 for axis in range(3)] for i in range(8)]).to(places.device)
     weights = torch.where(corners.bool(), share, 1 - share).prod(dim=3)
     rows = _hash_rows(base.long()[:, :, None, :] + corners, len(table) // len(resolutions))
-    summed = functional.embedding_bag(rows.flatten(0, 1), table, per_sample_weights=weights.flatten(0, 1), mode="sum")
+    firsts = torch.arange(0, rows.numel(), rows.shape[2], device=rows.device)
+    summed = functional.embedding_bag(
+        rows.flatten(), table, firsts, per_sample_weights=weights.flatten(), mode="sum"
+    )  # fmt: skip
     return summed.reshape(len(places), -1)
 
 
 def _hash_rows(corners: Int64[Tensor, "v l 8 3"], entries: int) -> Int64[Tensor, "v l 8"]:
     """The row of the joint table for each corner of each level; `entries` is a power of two."""
     x, y, z = (corners[..., axis] * prime for axis, prime in enumerate(PRIMES))
-    first = torch.arange(corners.shape[1])[:, None] * entries
+    first = torch.arange(corners.shape[1], device=corners.device)[:, None] * entries
     return ((x ^ y ^ z) & (entries - 1)) + first
 
 
@@ -151,11 +154,16 @@ class MixModel:
     background: tuple[float, float, float]
     metadata: Mapping[str, Any]
 
+    def to(self, device: str) -> MixModel:
+        """The same model on a device."""
+        network = {name: tensor.to(device) for name, tensor in self.network.items()}
+        return replace(self, gaussians=self.gaussians.to(device), offsets=self.offsets.to(device), network=network)
+
     @torch.no_grad()
     def render(self, camera: Camera, *, depth: bool = False) -> Raster:
         """One view: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None."""
         rows = visible_gaussian_rows(self.gaussians, camera)
-        behind = torch.tensor(self.background)
+        behind = self.offsets.new_tensor(self.background)
         return render_mixed(
             self.gaussians.select(rows), self.offsets[rows], self.network, self.scene, camera, behind, depth
         )

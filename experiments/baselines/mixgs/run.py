@@ -31,7 +31,13 @@ from vdgs.training.session.trainer import image_cache_bytes
 
 
 def run_mixgs(
-    run: RunFolder, capture: Capture, config: MixConfig, console: Console, *, lpips_weights: Path | None = None
+    run: RunFolder,
+    capture: Capture,
+    config: MixConfig,
+    console: Console,
+    *,
+    lpips_weights: Path | None = None,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Train (or continue) in RUN/mixgs and measure into RUN/evaluation.
 
@@ -39,23 +45,25 @@ def run_mixgs(
     """
     folder = StageFolder(run.path / "mixgs")
     with run.locked():
-        model = train_mixgs(capture, config, folder, console)
+        model = train_mixgs(capture, config, folder, console, device)
         write_json(run.capture_file, capture_metadata(capture))
     facts = BaselineFacts(
         name="mixgs", capture=model.metadata.get("capture", {}), trained=folder,
         num_gaussians=2 * len(model.gaussians),  # each with the one that is decoded beside it
     )  # fmt: skip
-    return evaluate_baseline(model, facts, capture, run.evaluation, console, lpips_weights=lpips_weights)
+    return evaluate_baseline(model.to(device), facts, capture, run.evaluation, console, lpips_weights=lpips_weights)
 
 
-def train_mixgs(capture: Capture, config: MixConfig, folder: StageFolder, console: Console) -> MixModel:
-    """The model of a capture; if it is finished, only read."""
+def train_mixgs(
+    capture: Capture, config: MixConfig, folder: StageFolder, console: Console, device: str = "cpu"
+) -> MixModel:
+    """The model of a capture, trained on a device; if it is finished, only read."""
     if folder.is_done():
         console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
         return MixModel.load(folder.model)
     before = StageFolder(folder.path / "coarse")
     before.path.mkdir(parents=True, exist_ok=True)
-    coarse = train_gs3d(capture, config.coarse, before.path, console)
+    coarse = train_gs3d(capture, config.coarse, before.path, console, device=device)
     with folder.locked():
         fresh, scene = mixed_state(coarse.gaussians, config)
         if not len(fresh.gaussians):
@@ -66,7 +74,7 @@ def train_mixgs(capture: Capture, config: MixConfig, folder: StageFolder, consol
             extent = scene_extent([view.camera for view in views])
             base = Gs3dProblem(length, images, len(views), extent, coarse.background, full_degree=True)
             problem = MixProblem(base, config, scene)
-            state = resume_or_start(folder, config.iterations, lambda: fresh, console)
+            state = resume_or_start(folder, config.iterations, lambda: fresh, console, device)
             train_with_checkpoints(
                 folder, state, base, CheckpointOptions(), console,
                 loop=lambda state, _, **hooks: train_mixed(state, problem, **hooks),

@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from experiments.baselines.gs3d.training import Gs3dProblem, Gs3dState, Gs3dStepReport, initial_state
+from experiments.baselines.gs3d.training import (
+    Gs3dProblem,
+    Gs3dState,
+    Gs3dStepReport,
+    initial_state,
+    photograph,
+)
 from experiments.baselines.mixgs.model import MixScene, initial_network, mix_scene, render_mixed
 from experiments.baselines.mixgs.settings import MixConfig
 from vdgs.errors import TrainingDiverged
@@ -69,7 +75,7 @@ def mixed_step(state: Gs3dState, problem: MixProblem) -> Gs3dStepReport:
     """
     base, iteration = problem.base, state.iteration
     view = view_at(iteration, base.image_count, base.config.seed)
-    target, mask = base.images.get(view, 1)
+    target, mask = photograph(base, view, 1, state.gaussians.means.device)
     camera = base.images.camera(view, 1)
     joint = iteration >= problem.config.frozen_iterations
     rows = visible_gaussian_rows(state.gaussians, camera)

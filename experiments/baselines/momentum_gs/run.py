@@ -33,8 +33,9 @@ def train_momentum_blocks(
     console: Console,
     config: MomentumConfig | None = None,
     options: CheckpointOptions | None = None,
+    device: str = "cpu",
 ) -> None:
-    """Train, or continue, all blocks of a run that is cut; nothing if they are finished.
+    """Train, or continue, all blocks of a run that is cut, on a device; nothing if they are finished.
 
     Raises RunError where no block has anchors and photographs, and what `run_session` raises.
     """
@@ -45,7 +46,7 @@ def train_momentum_blocks(
         if all(folder.is_done(key) for folder in folders):
             console.print(f"{run.path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
-        opened = context.open_model("coarse")
+        opened = context.open_model("coarse", device)
         capture, coarse = with_motion_masks(run, opened.capture), opened.model
         plans = [
             plan_block(coarse, capture, blocks, index, block_view_indices(run, capture, index), method)
@@ -61,7 +62,7 @@ def train_momentum_blocks(
             budget = image_cache_bytes(options) // len(able)
             problems = [
                 plan.problem(
-                    capture, blocks, method, opened_images.enter_context(plan.open_images(budget)), torch.device("cpu")
+                    capture, blocks, method, opened_images.enter_context(plan.open_images(budget)), torch.device(device)
                 )
                 for plan in able
             ]

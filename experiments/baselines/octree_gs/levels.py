@@ -105,8 +105,8 @@ def shown_anywhere(
 ) -> Bool[Tensor, " n"]:
     """Which anchors at least one camera is near enough to show, wherever it looks."""
     if octree.num_levels == 1:
-        return torch.ones(len(positions), dtype=torch.bool)
-    seen = torch.zeros(len(positions), dtype=torch.bool)
+        return torch.ones_like(levels, dtype=torch.bool)
+    seen = torch.zeros_like(levels, dtype=torch.bool)
     for camera in cameras:
         seen |= octree.shown(positions, levels, 0.0, camera, octree.num_levels)
     return seen

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -38,6 +38,11 @@ class OctreeModel:
     def background(self) -> tuple[float, float, float]:
         return self.anchors.background
 
+    def to(self, device: str) -> OctreeModel:
+        """The same model on a device."""
+        anchors = self.anchors.to(torch.device(device))
+        return replace(self, anchors=anchors, levels=self.levels.to(device), bias=self.bias.to(device))
+
     def rows(self, camera: Camera, level: int | None = None) -> Int64[Tensor, " v"]:
         """The anchors that a view shows, ascending; none finer than `level`."""
         rows = cull_anchors(self.anchors.anchors, camera)
@@ -61,7 +66,7 @@ class OctreeModel:
             for (first, last), (_, _, decoder) in zip(pairwise(bounds.tolist()), ranges, strict=True)
         ]
         splats = Splats(*(torch.cat([getattr(part, name) for part in parts]) for name in SPLAT_TENSORS))
-        return rasterize_splats(splats, camera, torch.tensor(self.background), depth)
+        return rasterize_splats(splats, camera, self.bias.new_tensor(self.background), depth)
 
     def save(self, folder: Path) -> None:
         """Write the levels, then the anchor model, whose file is the sign that all is there."""

@@ -34,7 +34,13 @@ from vdgs.training.session.training_session import restore_or_start
 
 
 def run_octree(
-    run: RunFolder, capture: Capture, config: OctreeConfig, console: Console, *, lpips_weights: Path | None = None
+    run: RunFolder,
+    capture: Capture,
+    config: OctreeConfig,
+    console: Console,
+    *,
+    lpips_weights: Path | None = None,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Train (or continue) in RUN/octree, with one level in RUN/scaffold, and measure into RUN/evaluation.
 
@@ -44,17 +50,19 @@ def run_octree(
     name = "scaffold" if config.levels == 1 else "octree"
     folder = StageFolder(run.path / name)
     with run.locked():
-        model = train_octree(capture, config, folder, console)
+        model = train_octree(capture, config, folder, console, device)
         write_json(run.capture_file, capture_metadata(capture))
     metadata = model.anchors.metadata
     facts = BaselineFacts(
         name=name, capture=dict(metadata.capture or {}), trained=folder, num_anchors=len(model.anchors.anchors)
     )
-    return evaluate_baseline(model, facts, capture, run.evaluation, console, lpips_weights=lpips_weights)
+    return evaluate_baseline(model.to(device), facts, capture, run.evaluation, console, lpips_weights=lpips_weights)
 
 
-def train_octree(capture: Capture, config: OctreeConfig, folder: StageFolder, console: Console) -> OctreeModel:
-    """The model of a capture; if it is finished, only read."""
+def train_octree(
+    capture: Capture, config: OctreeConfig, folder: StageFolder, console: Console, device: str = "cpu"
+) -> OctreeModel:
+    """The model of a capture, trained on a device; if it is finished, only read."""
     with folder.locked():
         if folder.is_done():
             console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
@@ -64,7 +72,7 @@ def train_octree(capture: Capture, config: OctreeConfig, folder: StageFolder, co
         octree = fit_octree(capture.points, cameras, config)
         write_json(folder.path / "settings.json", {"settings": to_dict(config), "octree": vars(octree)})
         with open_training_images(capture, config.training, image_cache_bytes(CheckpointOptions())) as images:
-            problem = octree_problem(capture, config, octree, images, cameras)
+            problem = octree_problem(capture, config, octree, images, cameras, device=device)
             start = lambda: octree_state(capture.points, cameras, problem, octree)  # noqa: E731
             return train_levels(folder, capture, octree, problem, start, console)
 
@@ -73,7 +81,8 @@ def train_levels(
     folder: StageFolder, capture: Capture, octree: Octree, problem: TrainingProblem,
     start: Callable[[], OctreeState], console: Console,
 ) -> OctreeModel:  # fmt: skip
-    """Train to the end, from the newest whole checkpoint or from the start, and save the model."""
+    """Train to the end, from the newest whole checkpoint or from the start, and save the model, which comes to main
+    memory."""
 
     def restore(saved: Checkpoint) -> OctreeState:
         state = from_checkpoint(saved, problem, start_state)
@@ -89,7 +98,7 @@ def train_levels(
     train_with_checkpoints(folder, state, problem, CheckpointOptions(), console)
     metadata = ModelMetadata(capture=capture_metadata(capture), version=__version__, iterations=state.iteration)
     anchors = state.model(problem, metadata)
-    model = OctreeModel(anchors, state.levels, state.bias, (octree,))
+    model = OctreeModel(anchors, state.levels, state.bias, (octree,)).to("cpu")
     model.save(folder.path)
     finish_stage(folder, state, anchors, console)
     return model

@@ -49,8 +49,9 @@ def start_state(
 ) -> OctreeState:
     """As `initial_state`; without `levels` all are 0 (of a checkpoint they are put there afterwards)."""
     plain = initial_state(anchors, decoder, problem)
-    levels = torch.zeros(len(anchors), dtype=torch.int32) if levels is None else levels
-    return OctreeState(**vars(plain), levels=levels, bias=torch.zeros(len(anchors)))
+    bias = torch.zeros_like(anchors.positions[:, 0])
+    levels = torch.zeros_like(bias, dtype=torch.int32) if levels is None else levels
+    return OctreeState(**vars(plain), levels=levels, bias=bias)
 
 
 def random_decoder(problem: TrainingProblem) -> Decoder:
@@ -66,6 +67,7 @@ def octree_problem(
     images: TrainingImages,
     cameras: Sequence[Camera],
     levels_at: Callable[[int], int] | None = None,
+    device: str = "cpu",
 ) -> TrainingProblem:
     """What training works on; `cameras` are those of the images. `levels_at`: how many levels an iteration draws, of
     those that are open."""
@@ -94,7 +96,7 @@ def octree_problem(
         # The volume term is of the capture's own unit, whose cube the loss divides by.
         camera_height=REFERENCE_HEIGHT * scale,
         offset_rate_factor=offset_rate_factor(capture, config.training),
-        select_rows=select, grow=grow,
+        select_rows=select, grow=grow, device=torch.device(device),
     )  # fmt: skip
 
 
@@ -103,7 +105,8 @@ def octree_state(
 ) -> OctreeState:
     """The state before the first step, with anchors at the sparse points."""
     anchors, levels = octree_starts(points, cameras, octree, problem.config.model.num_offsets)
-    return start_state(anchors, random_decoder(problem), problem, levels)
+    there = problem.device
+    return start_state(anchors.to(there), random_decoder(problem).to(there), problem, levels.to(there))
 
 
 @torch.no_grad()
@@ -127,7 +130,7 @@ def _grow(
     kept = torch.cat([decision.keep_mask, decision.keep_mask.new_ones(len(added))])
     new = {
         "anchors": added.tensors(), "largest": {"log_scale": problem.max_log_scale_at(added.positions)},
-        "octree": {"levels": levels, "bias": torch.zeros(len(added))},
+        "octree": {"levels": levels, "bias": torch.zeros_like(added.positions[:, 0])},
     }  # fmt: skip
     index_anchors(state, new, len(added), kept)
     return {"grown": len(added), "pruned": decision.pruned, "cycle": {}}
@@ -153,7 +156,7 @@ def grow_levels(
     """New anchors and their levels. An offset above its level's threshold asks for one in a cell of that level; above
     the next level's, in a cell of the next, with features of zero (program), if `deepen`."""
     limit = config.training.densify.max_anchors
-    added, added_levels = anchors.select(torch.zeros(0, dtype=torch.int64)), levels[:0]
+    added, added_levels = anchors.select(levels[:0].long()), levels[:0]
     for level in range(octree.num_levels):
         own, next_threshold = (levels == level)[:, None], float(_threshold(config, torch.tensor(level + 1.0)))
         same = own & (gradient >= float(_threshold(config, torch.tensor(float(level))))) & (gradient < next_threshold)
@@ -172,7 +175,7 @@ def grow_levels(
                 shown = shown_anywhere(octree, places, cells_level.expand(len(places)), cameras)
                 return shown if growth_mask is None else shown & growth_mask(places)
 
-            parents = Parents(index, gradient.reshape(-1)[index], torch.zeros(len(index), dtype=torch.bool))
+            parents = Parents(index, gradient.reshape(-1)[index], torch.zeros_like(index, dtype=torch.bool))
             more, _ = fill_cells(anchors, parents, taken, octree.cell(target), room, is_shown)
             if target > level:
                 more = replace(more, features=torch.zeros_like(more.features))

@@ -48,6 +48,10 @@ class Gaussians:
         """The Gaussians of the given rows (indices or mask)."""
         return Gaussians(**{name: tensor[rows] for name, tensor in self.tensors().items()})
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same Gaussians on a device; the same tensors where they are on it."""
+        return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
+
     def concat(self, more: Gaussians) -> Gaussians:
         """These Gaussians followed by others."""
         return Gaussians(**{name: torch.cat([t, more.tensors()[name]]) for name, t in self.tensors().items()})
