@@ -138,6 +138,36 @@ def test_what_an_earlier_driver_began_is_watched_and_not_begun_again(tmp_path):
     assert lines == ["block 00 on node-7 again"]
 
 
+def test_a_card_has_no_more_tasks_at_once_than_it_has_room_for(tmp_path):
+    """Those of one card end sooner than those of the other."""
+    begun, most = dict[str, int](), dict[str, int]()
+
+    class Working(Attempt):
+        def __init__(self, card: str):
+            super().__init__(AttemptResult(0))
+            self.card, self.polls = card, 9 if card == "cuda:0" else 1
+            begun[card] = begun.get(card, 0) + 1
+            most[card] = max(begun[card], most.get(card, 0))
+
+        def poll(self):
+            self.polls -= 1
+            begun[self.card] -= self.polls == 0
+            return self.end if self.polls == 0 else None
+
+    class Cards(Scripted):
+        def start(self, tasks):
+            return [Working(task.resources.device) for task, _ in tasks]
+
+    tasks = [
+        Task(name=str(place), command=["train"], output=tmp_path, resources=TaskResources(device=f"cuda:{place % 2}"))
+        for place in range(8)
+    ]
+    for each in (1, 2):
+        policy = ExecutionPolicy(2 * each, poll_seconds=1e-6, max_per_device=each)
+        assert [found.state for found in run_tasks(tasks, Cards([]), policy, TaskListener())] == ["done"] * 8
+        assert most == dict.fromkeys(("cuda:0", "cuda:1"), each)
+
+
 def test_what_the_system_refuses_is_named(tmp_path):
     outcome, _ = run(tmp_path, Scripted([OSError(28, "No space left on device", "/runs/00/output.log")]))
     assert outcome.state == "failed"
@@ -215,6 +245,7 @@ def test_cards_take_two_blocks_each_where_there_is_room(cards, at_once, question
     assert allocate_local(replace(work, jobs=7), machine).max_concurrent == 7
     with select_backend(ExecutorOptions(), work, machine, lambda: question) as chosen:
         assert f"{at_once} at once on {'one card' if len(cards) == 1 else '2 cards'} with" in chosen.description
+        assert chosen.executor.max_per_device == at_once // len(cards)
 
 
 def test_photographs_give_way_to_blocks_that_a_person_asked_for():

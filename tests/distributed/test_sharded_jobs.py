@@ -20,8 +20,10 @@ from support.commands import CommandsHere, threads_as_before, wait_until
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.serialization import to_dict
 from vdgs.distributed import run_shard as entry
+from vdgs.distributed.executor import TaskResources
 from vdgs.distributed.job_folders import clear, remove
 from vdgs.distributed.job_labels import shard_kind
+from vdgs.distributed.resource_allocation import Allocation
 from vdgs.distributed.shard import WORKERS, Results, Shard, run_shard, shard_session
 from vdgs.distributed.sharded_job import REQUEST, ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
 from vdgs.errors import RunError, Stopped, VdgsError
@@ -214,6 +216,15 @@ def test_a_job_keeps_what_is_done_and_is_gathered_in_the_order_of_its_items(tmp_
         assert job.file(2).stat().st_mtime_ns == kept
         assert [float(text) for text in job.gather(Path.read_text)] == [0.1 / 2**item for item in range(5)]
     assert [each.name for each in tmp_path.iterdir()] == ["go"]
+
+
+def test_shards_are_given_to_the_cards_in_turn(tmp_path):
+    job, share = job_of(tmp_path, "this"), Allocation(4, TaskResources(2, 10**9), 1.0)
+    commands = job._commands([1, 4, 5], share, ("cuda:0", "cuda:1"), "cuda:0")
+    cards = ["cuda:0", "cuda:1", "cuda:0"]
+    assert [each.command[-1] for each in commands] == [each.resources.device for each in commands] == cards
+    (alone,) = job._commands([1], share, (), "cpu")
+    assert (alone.command[-1], alone.resources) == ("cpu", share.resources)
 
 
 def test_a_shard_refuses_what_it_was_not_made_for(tmp_path, halves):

@@ -17,6 +17,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.levels import add_coarser_levels, fit_levels, level_sizes, pixel_sizes
 from vdgs.model.lod_nodes import load_anchors, save_anchors
 from vdgs.model.renderer import cull_anchors
+from vdgs.partition.block_regions import visible_anchors
 from vdgs.partition.merging import merge_blocks
 from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
 from vdgs.training import from_checkpoint, initial_state, to_checkpoint
@@ -52,7 +53,7 @@ def test_levels_follow_the_pixels_of_the_photographs():
     np.testing.assert_allclose(sizes[:2], [0.25 * 2**0.5, 0.5 * 2**0.5], rtol=0.06)
     assert sizes[2:] == (math.inf,)
     assert len(fit_levels(points, low, 4)) == 4
-    assert fit_levels(points, [], 3) == ()
+    assert fit_levels(points, [], 3) == fit_levels(points[:0], low, 3) == ()
 
 
 def test_the_farther_the_camera_the_fewer_anchors_it_draws():
@@ -72,6 +73,8 @@ def test_the_farther_the_camera_the_fewer_anchors_it_draws():
         assert torch.equal(everything, view_contributions(AnchorModel(**scene, anchors=plain), camera).gaussians)
         before = drawn
     assert before == set(np.flatnonzero(np.isinf(anchors.max_pixels.numpy())).tolist())
+    # Half of the steps of a block draw all levels of what is around.
+    assert torch.equal(visible_anchors(anchors, [raised(20.0)]), visible_anchors(plain, [raised(20.0)]))
     # A photograph that is shrunk is drawn as one from farther away.
     whole, half = raised(5.0), raised(5.0).resized(24, 20)
     torch.testing.assert_close(pixel_sizes(anchors.positions, half), 2 * pixel_sizes(anchors.positions, whole))
@@ -108,6 +111,9 @@ def test_training_keeps_levels_and_grows_each_in_its_own_cells(tmp_path):
     model.save(tmp_path / "model.safetensors")
     opened = AnchorModel.load(tmp_path / "model.safetensors")
     assert torch.equal(opened.anchors.max_pixels, state.anchors.max_pixels)
+    left = opened.without_anchors().anchors.tensors()
+    assert left.keys() == opened.anchors.tensors().keys()
+    assert not any(tensor.untyped_storage().nbytes() for tensor in left.values())  # the memory is free
     save_anchors(tmp_path / "leaf.safetensors", opened.anchors, np.arange(len(opened.anchors)))
     assert torch.equal(load_anchors(tmp_path / "leaf.safetensors")[0].max_pixels, state.anchors.max_pixels)
     merged, _ = merge_blocks(opened, [opened, opened], BLOCKS, [Photographs().cameras] * 2, MergeConfig())

@@ -86,6 +86,7 @@ class CommandsHere:
     """An executor that runs modules of vdgs in this process, one after the other: processes without their start."""
 
     max_concurrent: int
+    max_per_device: int = 0
 
     def run(self, tasks: Sequence[Task], _listener: TaskListener) -> list[TaskResult]:
         from vdgs.distributed.executor import TaskResult

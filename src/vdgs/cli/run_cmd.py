@@ -47,10 +47,10 @@ class TrainCoarseArguments(ConfigFileArguments, ComputeOptions, QuietArguments):
     output: Annotated[Path, Output()]
     """Run folder; new, or the run to continue."""
     preset: PresetChoice = "auto"
-    """Settings by name. `auto`: those of the run that is there, else `laptop` on a CPU
-    and `default` on a GPU. `laptop`: a good result in minutes on a CPU. `default`: the paper's 100 000 iterations, and
-    our choices where it is silent: gaps filled, outliers left out, a background of the mean color, of random colors in
-    training, bounded sizes, only visible anchors moved. `paper`: none of those choices."""
+    """Settings by name. `auto`: those of the run that is there, else `laptop`. `laptop`: a good result in minutes on a
+    CPU. `default`: the paper's 100 000 iterations, and our choices where it is silent: gaps filled, outliers left out,
+    a background of the mean color, of random colors in training, bounded sizes, only visible anchors moved. `paper`:
+    none of those choices."""
     options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, FlagName("")] = field(default_factory=TrainConfig)
     checkpointing: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)
@@ -129,7 +129,7 @@ class ConfigArguments(ConfigFileArguments):
     output: Annotated[Path | None, Output()] = None
     """File to write, such as settings.yaml; without it they are printed."""
     preset: PresetChoice = "auto"
-    """Settings by name. `auto` takes what suits this machine."""
+    """Settings by name. `auto` takes `laptop`."""
     overwrite: bool = False
     """Replace a file that is there."""
     options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)

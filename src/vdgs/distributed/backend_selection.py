@@ -90,7 +90,8 @@ def _local(workload: ShardWorkload, machine: MachineResources) -> SelectedBacken
     if exceeds_memory(workload, at_once, machine.free_bytes):
         remedies = ", ".join(("less --jobs", *kind.memory_saving_options))
         notes = (f"[yellow]warning[/] {at_once} at once may run out of memory. What helps: {remedies}",)
-    return SelectedBackend(LocalExecutor(at_once), allocation, text, notes)
+    executor = LocalExecutor(at_once, max_per_device=-(-at_once // max(1, len(machine.cards))))
+    return SelectedBackend(executor, allocation, text, notes)
 
 
 def _on_cards(machine: MachineResources) -> str:

@@ -32,6 +32,8 @@ class TaskResources:
     """0: not stated."""
     gpus: float = 0.0
     """Fractions are possible where the executor knows them."""
+    device: str = ""
+    """The card of this machine that it computes on, where there is a choice of them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,6 +45,8 @@ class ExecutionPolicy:
     poll_seconds: float = 0.5
     lock_timeout_seconds: float = 60.0
     """How long to wait for a process that still holds a task's folder: one whose driver was killed, and that saves."""
+    max_per_device: int = 0
+    """How many tasks that name the same device run side by side; 0: no limit but `max_concurrent`."""
 
     def __post_init__(self) -> None:
         if self.max_concurrent < 1 or self.retries < 0:
@@ -161,7 +163,7 @@ class _TaskScheduler:
         for state in list(self._waiting):
             before = self._by_name.get(state.task.after) if state.task.after is not None else None
             end = before.result if before is not None else None
-            has_room = len(self._running) + len(ready) < self._max_concurrent
+            has_room = len(self._running) + len(ready) < self._max_concurrent and not self._is_full(state.task, ready)
             if end is not None and end.state != "done":
                 self._waiting.remove(state)
                 self._start(ready)
@@ -170,6 +172,12 @@ class _TaskScheduler:
                 self._waiting.remove(state)
                 ready.append(state)
         self._start(ready)
+
+    def _is_full(self, task: Task, ready: Sequence[_TaskState]) -> bool:
+        """Whether the device of a task has as many others as it has room for."""
+        device, most = task.resources.device, self._policy.max_per_device
+        others = [state for state in (*self._running, *ready) if state.task.resources.device == device]
+        return bool(device) and 0 < most <= len(others)
 
     def _start(self, ready: list[_TaskState]) -> None:
         """Begin an attempt at each; the list is empty then."""

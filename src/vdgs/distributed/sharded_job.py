@@ -18,7 +18,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -182,11 +182,7 @@ class ShardedJob:
             request = {name: value for name, value in to_dict(self.request).items() if name not in EXECUTION_FIELDS}
             write_json(self.folder / REQUEST, {"worker": self.worker, "request": request})
             (on_ready or self.mark_queued)()
-            share, devices = backend.allocation, itertools.cycle(cards or [execution.device])
-            commands = [
-                ShardCommand(index, self.shard(index), self._command(index, share, device), share.resources, kind)
-                for index, device in zip(shards, devices, strict=False)
-            ]
+            commands = self._commands(shards, backend.allocation, tuple(cards), execution.device)
             results = run_shards(commands, backend.executor, console)
         self._raise_unless_done(results, total)
 
@@ -201,6 +197,16 @@ class ShardedJob:
             with suppress(RunError), folder.locked():
                 if not self.is_done(index):
                     folder.set_status(StatusRecord(state="queued"))
+
+    def _commands(
+        self, shards: Sequence[int], share: Allocation, cards: Sequence[str], device: str
+    ) -> list[ShardCommand]:
+        """The shards, on the cards in turn; on the device where there are none."""
+        places = [(card, replace(share.resources, device=card)) for card in cards] or [(device, share.resources)]
+        return [
+            ShardCommand(index, self.shard(index), self._command(index, share, place), resources, self.kind)
+            for index, (place, resources) in zip(shards, itertools.cycle(places), strict=False)
+        ]
 
     def _command(self, index: int, allocation: Allocation, device: str) -> list[str]:
         # A GPU that a shard is given is not this machine's.

@@ -79,12 +79,13 @@ class AnchorModel:
 
     def with_all_levels(self) -> AnchorModel:
         """The model of which every view draws all levels of the anchors; itself where they have none."""
-        plain = self.anchors.max_pixels is None
-        return self if plain else replace(self, anchors=replace(self.anchors, max_pixels=None))
+        anchors = self.anchors.with_all_levels()
+        return self if anchors is self.anchors else replace(self, anchors=anchors)
 
     def without_anchors(self) -> AnchorModel:
         """The decoders of the model, whose spans still say which rows they decode."""
-        return replace(self, anchors=Anchors(**{name: tensor[:0] for name, tensor in self.anchors.tensors().items()}))
+        none = torch.zeros(0, dtype=torch.long, device=self.anchors.positions.device)
+        return replace(self, anchors=self.anchors.select(none))  # copies: slices would keep the tensors in memory
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""

@@ -5,7 +5,7 @@ Dimensions: n anchors, k offsets per anchor, 32 features. Positions are float32 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -33,6 +33,10 @@ class Anchors:
         names = ("positions", *TRAINED_TENSORS)
         levels = {} if self.max_pixels is None else {"max_pixels": self.max_pixels}
         return {name: getattr(self, name) for name in names} | levels
+
+    def with_all_levels(self) -> Anchors:
+        """The anchors of which every view draws all levels; themselves where they have none."""
+        return self if self.max_pixels is None else replace(self, max_pixels=None)
 
     def to(self, device: torch.device) -> Anchors:
         """The same anchors on a device; themselves where they are on it."""

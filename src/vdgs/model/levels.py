@@ -47,11 +47,13 @@ def fit_levels(points: Float[np.ndarray, "p 3"], cameras: Sequence[Camera], coun
     drawn in pixels of up to √2 times the size that it is for. `count` 0: as many as the coarsest pixels ask for, if
     three or more. One level: empty.
     """
+    if count == 1 or not len(points):
+        return ()
     places = torch.from_numpy(points[:: -(-len(points) // MAX_POINTS)].astype(np.float32))
     kernels = get_backend(places.device)
     held = [pixel_sizes(places[kernels.mark_visible(places, camera)], camera) for camera in cameras]
     medians = [float(sizes.median()) for sizes in held if len(sizes)]
-    if count == 1 or not medians:
+    if not medians:
         return ()
     finest, coarsest = np.quantile(medians, [OUTER_SHARE, 1 - OUTER_SHARE]).tolist()
     if not count:

@@ -41,8 +41,8 @@ def split_trainable_anchors(anchors: Anchors, blocks: Blocks, index: int, config
 
 
 def visible_anchors(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
-    """Which anchors one of the cameras may draw."""
-    drawn = torch.zeros_like(anchors.positions[:, 0], dtype=torch.bool)
+    """Which anchors one of the cameras may draw, in steps that draw all levels too."""
+    drawn, anchors = torch.zeros_like(anchors.positions[:, 0], dtype=torch.bool), anchors.with_all_levels()
     for camera in cameras:
         drawn[cull_anchors(anchors, camera)] = True
     return drawn

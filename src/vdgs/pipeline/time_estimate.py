@@ -42,6 +42,8 @@ MAX_CROWDING, CROWD_SPREAD = 20.0, 3.0
 #: Of finding what moves: drawing a training photograph and its depth, in steps, and comparing it with twenty others
 #: (measured: 0.02 to 0.05 s and 0.1 to 0.4 s at 320 to 407 pixels of width), in processor seconds.
 MOTION_VIEW_STEPS, MOTION_VIEW_SECONDS = 0.7, 0.3
+#: Time that pseudo views (`loss.pseudo_views`) add to the steps of a stage, as a share (measured).
+PSEUDO_VIEWS_SHARE = 0.2
 #: Share of a photograph's stereo that confirming its depths adds to finding them.
 CONFIRMING = 0.15
 #: What measuring a view takes, in training steps of its size: of the coarse model, and of the merged one with its
@@ -73,7 +75,7 @@ class StepTimes:
         total = NO_COST
         for (begin, factor), end in zip(config.resolution_schedule, ends, strict=True):
             total += self.step(pixels / factor**2, mean) * (config.iterations * max(0.0, end - begin))
-        return total
+        return total * (1 + PSEUDO_VIEWS_SHARE) if config.loss.pseudo_views else total
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -58,7 +58,7 @@ def levels_at(anchors: Anchors, seed: int, iteration: int) -> Anchors:
     above then train fine anchors too, without which these overfit the few photographs from near."""
     if anchors.max_pixels is None or np.random.default_rng((seed, 1, iteration)).random() >= ALL_LEVELS_SHARE:
         return anchors
-    return replace(anchors, max_pixels=None)
+    return anchors.with_all_levels()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

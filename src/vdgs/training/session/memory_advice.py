@@ -36,7 +36,7 @@ def training_workload(state: TrainingState, stage: TrainingProblem) -> TrainingW
     cameras = [stage.images.camera(view) for view in range(count)]
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_COUNTED_VIEWS)).astype(int))
     anchors = state.anchors
-    seen = [len(cull_anchors(anchors, cameras[view])) for view in chosen]
+    seen = [len(cull_anchors(anchors.with_all_levels(), cameras[view])) for view in chosen]
     photographs = decoded_image_bytes(cameras)
     growing = config.densify.num_levels > 0 and state.iteration <= config.densify.stop_fraction * config.iterations
     return TrainingWorkload(
