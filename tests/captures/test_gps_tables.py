@@ -254,6 +254,7 @@ def test_systems_are_known_by_all_their_names(tmp_path, header, code):
         ("name,lat,lon,alt", "33.30.00.000S,70.36.00W,500"),
         ("name,lat,lon,alt", "3330.0000 S,07036.0000 W,500"),
         ("name,lat,lat ref,lon,lon ref,alt", "3330.0000,S,07036.0000,W,500"),
+        ("name,lat (rad),lon (deg),alt", '-0.5846852994181004,-70.6,"0,000,500.0"'),
         ("OBJECTID,Name,POINT_X,POINT_Y,POINT_Z", None),  # degrees without a system: a.jpg and others of one place
     ],
 )
@@ -278,6 +279,20 @@ def test_angles_that_are_no_degrees_are_told(tmp_path, text, message):
     (tmp_path / "table.csv").write_text(text)
     with pytest.raises(CaptureError, match=message):
         read_gps_table(tmp_path / "table.csv")
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        ("5130.6,N,00030.6,W", (51.51, -0.51)),
+        ("5130.6,N,30.6,W", (51.51, -0.51)),  # as spreadsheets save it
+        ("0030.6,S,00006.0,E", (-0.51, 0.1)),
+        ("51.51,N,30.6,W", (51.51, -30.6)),
+    ],
+)
+def test_minutes_of_places_at_greenwich_and_the_equator_are_no_degrees(tmp_path, words, place):
+    (tmp_path / "t.csv").write_text(f"name,lat,lat ref,lon,lon ref\na.jpg,{words}\n")
+    assert read_gps_table(tmp_path / "t.csv").rows[0].position[:2] == pytest.approx(place)
 
 
 @pytest.mark.parametrize(("x", "y"), [('"351,362.43"', '"6,292,126.02"'), ("351.362,43", "6.292.126,02")])
@@ -307,6 +322,9 @@ def test_units_of_the_columns_of_x_and_y_count(tmp_path, system, names, factors)
     named.write_text(f"{system}\n{names}\na.jpg,{','.join(map(repr, (given * factors).tolist()))}\n")
     (wanted,), (found,) = read_gps_table(plain).rows, read_gps_table(named).rows
     assert found.position == pytest.approx(wanted.position, abs=1e-9)
+    for unit, said in (("m", system == "EPSG:2225"), ("ft", False)):  # whether heights are taken as metres
+        named.write_text(f"{system}\nname,x,y,z ({unit})\na.jpg,{','.join(map(repr, given.tolist()))}\n")
+        assert ("heights are taken as metres" in "".join(read_gps_table(named).notes)) is said
     named.write_text(f"EPSG:4326\n{names}\na.jpg,0.01,0.02,5\n")
     with pytest.raises(CaptureError, match="unit of length, but EPSG:4326 counts in degrees"):
         read_gps_table(named)

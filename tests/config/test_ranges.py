@@ -76,6 +76,7 @@ def test_numbers_are_found_wherever_they_stand():
         (RunArguments, "--iterations", "2.5k", 2500),
         (RunArguments, "--iterations", "30.000", None),  # thirty thousand to half of the world
         (RunArguments, "--iterations", "1e400", None),
+        (RunArguments, "--seed", "9007199254740993", 9007199254740993),  # no number of floating point
         (RunArguments, "--blocks", "auto", "auto"),
         (RunArguments, "--downscale", "1,5", 1.5),
         (RunArguments, "--downscale", "1,500", None),
@@ -171,4 +172,8 @@ def test_a_value_of_another_kind_is_named(settings, says):
 def test_a_number_that_yaml_takes_for_text_is_still_one():
     densify = from_dict(MethodConfig, {"block": {"densify": {"grad_threshold": "1e-4"}}}).block.densify
     assert densify.grad_threshold == 1e-4
+    for said, number in (("1e3", 1000), (1e3, 1000), ("9007199254740993", 9007199254740993)):
+        assert from_dict(MethodConfig, {"training": {"seed": said}}).training.seed == number
+    for said, word in ((True, "on"), (False, "off"), ("auto", "auto")):  # YAML takes on and off for truth
+        assert from_dict(MethodConfig, {"block": {"mask_moving": said}}).block.mask_moving == word
     assert to_dict(from_dict(CaptureOptions, {"gps": "/a.csv"}))["gps"] == "/a.csv"

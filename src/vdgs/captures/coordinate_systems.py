@@ -23,6 +23,8 @@ _STARTS = re.compile(
 _AROUND = " \t\r\n,;'\""
 #: Places that differ by less than this are of one flight in degrees, and one place in metres.
 _ONE_PLACE = 0.2
+#: What is said of systems in feet, where nothing says the unit of heights.
+HEIGHTS_IN_METERS = "; x and y in feet, heights are taken as metres"
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
 _GLOBAL = {"WGS 84", "GRS 1980"}
 #: ODM's words for the zones of UTM, and those that people write in their place.
@@ -89,7 +91,7 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
             "to some hundred metres (an EPSG code, or +towgs84, names it)"
         )
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
-    return changed, f"{name}; x and y in feet, heights are taken as metres" if feet else name
+    return changed, f"{name}{HEIGHTS_IN_METERS}" if feet else name
 
 
 def look_like_degrees(places: np.ndarray) -> bool:

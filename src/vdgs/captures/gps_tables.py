@@ -16,8 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vdgs.captures.angles import LIMITS, degrees_of_text
-from vdgs.captures.coordinate_systems import in_units_of, look_like_degrees, names_a_system, to_geodetic
+from vdgs.captures.angles import degrees_of_text
+from vdgs.captures.coordinate_systems import (
+    HEIGHTS_IN_METERS,
+    in_units_of,
+    look_like_degrees,
+    names_a_system,
+    to_geodetic,
+)
 from vdgs.captures.table_columns import ANGLES, RADIANS, known_columns, meters_of, number_of
 from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
 from vdgs.errors import CaptureError
@@ -44,6 +50,8 @@ _UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
+#: Degrees and minutes in one number, of which programs may have cut the zeros before the other angle of the row.
+_NMEA = re.compile(r"\d{4,5}\.\d+")
 #: DJI's list of moments (.MRK): one line for each photograph, by its number.
 _MRK = re.compile(r"([-\d.]+),Lat\s+([-\d.]+),Lon\s+([-\d.]+),Ellh")
 
@@ -126,7 +134,9 @@ def read_gps_table(file: Path) -> GpsTable:
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
-    if columns.system is not None and (doubt := to_geodetic(columns.system, file)[1].partition("; ")[2]):
+    system = "" if columns.system is None else to_geodetic(columns.system, file)[1]
+    system = system if columns.altitude_unit == 1 else system.removesuffix(HEIGHTS_IN_METERS)
+    if doubt := system.partition("; ")[2]:
         notes.append(f"{file.name}: {doubt}.")
     if len(placed) < len(rows):
         notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
@@ -155,11 +165,11 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
     named = {what: rows[0].words[known[what]] for what in _DEVIATIONS if what in known}
     units = {what: math.nan if ANGLES.search(word) else meters_of(word) for what, word in named.items()}
     if {"name", "lat", "lon"} <= set(known):
-        radians = all(RADIANS.search(rows[0].words[known[what]]) for what in ("lat", "lon"))
-        angle = math.degrees(1) if radians else 1.0
-        return _Columns(known, None, unit, heights=heights, deviation_units=units, across_units=(angle, angle)), rows[
-            1:
-        ]
+        latitude, longitude = (
+            math.degrees(1) if RADIANS.search(rows[0].words[known[what]]) else 1.0 for what in ("lat", "lon")
+        )
+        angles = latitude, longitude
+        return _Columns(known, None, unit, heights=heights, deviation_units=units, across_units=angles), rows[1:]
     if {"lat", "lon"} <= set(known):
         raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
     if {"name", "x", "y"} <= set(known):
@@ -257,8 +267,8 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str) ->
     try:
         number, side_word = float(word), _word(row, columns, reference)[:1]
         read: tuple[float, bool] | None = (number, False)
-        if abs(number) > LIMITS[axis] and side_word:
-            read = degrees_of_text(f"{word} {side_word}", axis) or read
+        if side_word and any(_NMEA.fullmatch(_word(row, columns, each)) for each in ("lat", "lon")):
+            read = degrees_of_text(f"{abs(number) // 100:.0f} {abs(number) % 100:.9f} {side_word}", axis) or read
     except ValueError:
         read = degrees_of_text(word, axis)
     if read is None:
@@ -271,6 +281,7 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     word = _word(row, columns, "alt")
     if word.lower() in _UNKNOWN:
         return math.nan
+    word = re.sub(r"[.,](?=.*[.,])", "", word) if math.isfinite(number_of(word)) else word  # thousands
     number = _LEADING_NUMBER.match(word)
     unit = meters_of(word)
     if number is None or (word[number.end() :].strip() and "sea" not in word.lower() and unit == 1):

@@ -235,7 +235,7 @@ def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
 def _mask(path: Path) -> np.ndarray:
     """What a mask keeps at its own size, [h, w] bool: of instant-ngp's what is black, of others what is bright."""
     light = _lightness(path)
-    return light == 0 if path.name.startswith(DYNAMIC_MASK) else _kept(light)
+    return light == 0 if path.name.lower().startswith(DYNAMIC_MASK) else _kept(light)
 
 
 def _lightness(mask: Path) -> np.ndarray:
@@ -347,6 +347,15 @@ def _extremes(image: Image.Image, band: str) -> tuple[float, float]:
     return image.getchannel(band).getextrema()  # type: ignore[return-value]
 
 
+def _why_nothing(mask: Path) -> str:
+    """Why a mask keeps nothing, and what to do."""
+    if mask.name.lower().startswith(DYNAMIC_MASK):
+        return f"Black is kept of masks that are named {DYNAMIC_MASK}..., and none of it is black. Turn it round"
+    brightest = int(_lightness(mask).max())
+    hint = "Scale its values to 0 and 255" if brightest else "Turn it round if it is inverted"
+    return f"White is kept, and the brightest value here is {brightest} of 255. {hint}"
+
+
 def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:
     """The share of a photograph that its mask and its transparency keep; 1 without either.
 
@@ -357,11 +366,9 @@ def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool)
     if mask is not None:
         kept = _mask(mask)
         if not kept.any():
-            light = _lightness(mask)
-            hint = "Scale its values to 0 and 255" if light.any() else "Turn it round if it is inverted"
             raise CaptureError(
-                f"{mask}: leaves nothing of its photograph. White is kept, and the brightest value here is "
-                f"{light.max()} of 255. {hint}, or remove the photograph from the model."
+                f"{mask}: leaves nothing of its photograph. {_why_nothing(mask)}, or remove the photograph from the "
+                "model."
             )
         keep = kept if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
     if keep is not None and not keep.any():

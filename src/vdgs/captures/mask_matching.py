@@ -28,7 +28,9 @@ def find_masks(
     if asked_for and not folder.is_dir() and Path(options.masks).is_dir():
         folder = Path(options.masks)  # given from where the person stands
     if asked_for and not folder.is_dir():
-        moving = " Masks of what moves are made with --block.mask-moving on." if options.masks == "auto" else ""
+        moving = (
+            " Of what moves they are made by --masks masks --block.mask-moving on." if options.masks == "auto" else ""
+        )
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.{moving}")
     masks = dict[str, Path | None]()
     for view in views:

@@ -52,7 +52,7 @@ FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
 _ALTITUDE = re.compile(r"alt(?!ura)|elli?p|ellh|elev|海拔", re.IGNORECASE)
 #: Altitudes by names that are put together: `ell_hgt`, `alt_msl`, `Orthometric elevation`, `pointz`; none over ground.
 _ALTITUDES = re.compile(
-    r"(?:gps|gnss|abs|absolute|ell|ellips|ellipsoid(?:al)?|ortho|orthometric|msl|amsl|wgs84|camera|geoid|sensor)*"
+    r"(?!sensorheight)(?:gps|gnss|abs|absolute|ell|ellips|ellipsoid(?:al)?|ortho|orthometric|msl|amsl|wgs84|camera|geoid|sensor)*"
     r"(?:altitude|alt|height|hgt|hght|elevation|elev)"
     r"(?:gps|abs|ell|ellips|ellipsoid(?:al)?|ortho|msl|amsl|wgs84|m)*|pointz"
 )

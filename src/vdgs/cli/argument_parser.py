@@ -229,7 +229,7 @@ def _spelled(name: str) -> str:
 
 def _is_number(word: str) -> bool:
     """Whether a word is a negative number, such as -5, -.5 and -1,5."""
-    return re.match(r"-\.?\d|-(inf|nan)", word, re.IGNORECASE) is not None
+    return re.match(r"-\.?\d|-(inf(inity)?|nan)$", word, re.IGNORECASE) is not None
 
 
 #: What other programs call options of ours; the first that a verb has is meant.

@@ -59,6 +59,8 @@ def plain_number(word: str, flag: str, hint: Any) -> str:
         plain, factor = found[1], factors[unit]
     if re.fullmatch(_NUMBER, plain, re.IGNORECASE) is None or (not whole and factor == 1 and plain == word):
         return plain if factor == 1 else word
+    if factor == 1 and re.fullmatch(r"[+-]?[\d_]+", plain):
+        return plain  # with all its digits
     value = float(plain) * factor
     decimals = re.fullmatch(r"[+-]?\d+\.\d{3}", plain) is not None  # 30.000 is thirty thousand to many
     if not whole:
@@ -74,5 +76,6 @@ def how_to_write(words: str, flag: str, hint: Any) -> str:
     units = {"m": "metres", "gsd": "units of the map, mostly metres", "seconds": "seconds", "gb": "GB", "mb": "MB"}
     unit = units.get(re.split(r"[.-]", flag)[-1])
     how = "such as 0.25 or 1e-3" if float in kinds else "such as 30000, 30k or 3e4"
-    apart = ", parted by blanks" if typing.get_origin(without_notes(hint)) is tuple else ""
+    kinds_in = (hint, *typing.get_args(without_notes(hint)))
+    apart = ", parted by blanks" if any(typing.get_origin(without_notes(each)) is tuple for each in kinds_in) else ""
     return f"; write {how}{f', in {unit}' if unit else ''}{apart}"

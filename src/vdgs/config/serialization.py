@@ -105,21 +105,31 @@ def _read(hint: Any, value: Any, where: str) -> Any:
         for each in inner:
             with suppress(ValueError):
                 return _read(each, value, where)
-    if origin is typing.Literal and value in inner:
-        return value
+    if origin is typing.Literal:
+        word = ("off", "on")[value] if isinstance(value, bool) else value  # which YAML makes of these words
+        if word in inner:
+            return word
     if kind is Path and isinstance(value, (str, Path)):
         return Path(value)
     if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4
         with suppress(ValueError):
             return float(value)
     if kind is int and isinstance(value, (str, float)):  # and 1e3, too
-        with suppress(ValueError, OverflowError):
-            if (number := float(value)).is_integer():
-                return int(number)
+        with suppress(ValueError):
+            return int(value) if isinstance(value, str) else _whole(value)
+        with suppress(ValueError):
+            return _whole(float(value))
     plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
     if plain and (kind is bool or not isinstance(value, bool)):
         return value
     raise ValueError(f"{where} is {value!r}; it must be {describe_type(hint)}")
+
+
+def _whole(number: float) -> int:
+    """A number without decimals. ValueError for others."""
+    if not number.is_integer():
+        raise ValueError
+    return int(number)
 
 
 def without_notes(hint: Any) -> Any:

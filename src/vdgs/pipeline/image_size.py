@@ -102,6 +102,7 @@ def choose_for_photographs(
         sizes += [
             ImageSize(images=name, downscale=more, width=full.width // factor, height=full.height // factor)
             for name, factor, more in smaller
+            if factor <= min(full.width, full.height)
         ]
     with tempfile.TemporaryDirectory(prefix="vdgs-") as folder:
         count = len(plan.image_list.images)

@@ -130,7 +130,7 @@ def _one_altitude(group: list[ImageMetadata]) -> list[ImageMetadata]:
             if each != most:
                 altitude = (in_exif, in_xmp)[most][0]
                 if not altitude and in_xmp[0] is not None:
-                    altitude = in_xmp[0] + float(np.median(apart))
+                    altitude = in_xmp[0] + float(np.median(apart or [0.0]))
                 found[k] = replace(group[k], altitude=altitude, altitude_type=kind.most_common(1)[0][0])
     return found
 
@@ -230,7 +230,9 @@ def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     for photo in photographs:
         match = _COPY_NAME.fullmatch(PurePosixPath(photo.name).with_suffix("").as_posix())
         first = names.get(match[1].lower()) if match else None
-        if first is not None and photo.datetime and (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon):
+        if first is None or not photo.datetime or photo.camera != first.camera:
+            continue
+        if (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon):
             found[photo.name] = f"is a copy or another version of {first.name}, by its name, moment and place"
     return found
 

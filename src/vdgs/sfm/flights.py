@@ -64,8 +64,9 @@ def _steps(altitudes: np.ndarray) -> np.ndarray:
 
 def _jumps(values: np.ndarray, least: float, times: float) -> np.ndarray:
     changes = np.abs(np.diff(values, prepend=values[:1]))
-    usual = np.median(changes[1:]) if len(values) > 1 else 0.0
-    return np.asarray(np.nan_to_num(changes) > max(least, times * float(np.nan_to_num(usual))))
+    known = changes[1:][np.isfinite(changes[1:])]
+    usual = float(np.median(known)) if len(known) else 0.0
+    return np.asarray(np.nan_to_num(changes) > max(least, times * usual))
 
 
 @dataclass(frozen=True, eq=False)

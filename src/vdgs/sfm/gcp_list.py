@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.coordinate_systems import in_units_of, to_geodetic
+from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, in_units_of, to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.captures.table_columns import known_columns, meters_of, number_of
@@ -100,6 +100,7 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     """
     header, rows, (across, along, up) = _rows(file)
     transform, system = to_geodetic(header, file)
+    system = system if up == 1 else system.removesuffix(HEIGHTS_IN_METERS)
     units = in_units_of(header, across, file), in_units_of(header, along, file), up
     lines = [_line(row, file, units) for row in rows]
     by_name = photographs_by_name(collection)

@@ -93,7 +93,7 @@ def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str],
     if held != (True, OF_FLIGHTS):
         return held
     model = models[0]
-    images = placed_images(model)
+    images = [image for image in placed_images(model) if image.num_points3D]
     heights = np.array([_height_over_points(image, model) for image in images])
     views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     ahead = np.median(views, axis=0) / np.linalg.norm(np.median(views, axis=0))

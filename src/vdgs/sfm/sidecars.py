@@ -30,7 +30,9 @@ def with_sidecars(photo: ImageMetadata) -> ImageMetadata:
         geo = [content.get(key) for key in ("geoDataExif", "geoData")]  # the camera's before what people set
         for place in (each for each in geo if isinstance(each, dict)):
             latitude, longitude, altitude = (finite(place.get(key)) for key in ("latitude", "longitude", "altitude"))
-            if latitude is None or longitude is None or not (latitude or longitude) or abs(latitude) > 90:
+            if latitude is None or longitude is None or not (latitude or longitude):
+                continue
+            if abs(latitude) > 90 or abs(longitude) > 180:
                 continue
             kind = f"{file.suffix} of Google Takeout as recorded, datum not stated"
             return replace(
