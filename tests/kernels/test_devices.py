@@ -81,6 +81,7 @@ class TestWhichRasterizerDraws:
 def test_without_a_driver_auto_is_the_processor_and_loads_nothing(monkeypatch, tmp_path):
     monkeypatch.setattr(device_selection, "_no_card", lambda index: pytest.fail("a card was looked for"))
     monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path / "none")
+    monkeypatch.setattr(device_selection, "WSL_DEVICE", tmp_path / "none")
     assert select_device("auto") == SelectedDevice("cpu", "this machine has no NVIDIA GPU")
     assert select_device("cpu") == SelectedDevice("cpu", "as asked for")
 
@@ -104,8 +105,10 @@ class TestWithCards:
         assert select_device("cuda") == SelectedDevice("cuda:0", "as asked for")
         assert select_device("cuda:1").device == "cuda:1"
 
-    def test_auto_takes_the_first_card(self, monkeypatch, tmp_path):
-        monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path)
+    @pytest.mark.parametrize("sign", ["DRIVER_FOLDER", "WSL_DEVICE"])
+    def test_auto_takes_the_first_card(self, sign, monkeypatch, tmp_path):
+        monkeypatch.setattr(device_selection, "DRIVER_FOLDER", tmp_path / "none")
+        monkeypatch.setattr(device_selection, sign, tmp_path)
         assert select_device("auto") == SelectedDevice("cuda:0", "there is a card that can be used")
 
     def test_processes_share_all_cards_but_where_another_than_the_first_is_asked_for(self):

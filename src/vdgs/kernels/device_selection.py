@@ -15,6 +15,8 @@ class DeviceUnavailable(VdgsError):
 
 #: Is there where a driver of NVIDIA is loaded; torch, which knows for sure, takes seconds to load.
 DRIVER_FOLDER = Path("/proc/driver/nvidia")
+#: Windows' cards within its Linux (WSL 2), which has no such folder.
+WSL_DEVICE = Path("/dev/dxg")
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ def select_device(device: str) -> SelectedDevice:
         raise VdgsError(f"--device {device}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")
     if device == "cpu":
         return SelectedDevice("cpu", "as asked for")
-    if device == "auto" and not DRIVER_FOLDER.exists():
+    if device == "auto" and not (DRIVER_FOLDER.exists() or WSL_DEVICE.exists()):
         return SelectedDevice("cpu", "this machine has no NVIDIA GPU")
     index = int(named.group(1) or 0)
     reason = _no_card(index)
