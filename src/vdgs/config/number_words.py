@@ -7,7 +7,7 @@ import typing
 from typing import Any
 
 from vdgs.config.ranges import Range
-from vdgs.config.serialization import without_notes
+from vdgs.config.type_hints import without_notes
 
 _NUMBER = r"[+-]?(?:\d[\d_]*\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 _WITH_UNIT = re.compile(rf"({_NUMBER})\s*([a-zµ%°]+)", re.IGNORECASE)

@@ -24,7 +24,7 @@ from typing import Any
 
 from vdgs.config.number_words import how_to_write, plain_number
 from vdgs.config.ranges import FlagName, Positional, Repeatable, to_flag
-from vdgs.config.serialization import describe_type, field_hints, without_notes
+from vdgs.config.type_hints import describe_type, field_hints, without_notes
 
 #: Other names of an option: shorter ones, and those that scripts of before use.
 ALIASES = {

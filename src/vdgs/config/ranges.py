@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from types import UnionType
 from typing import Any
 
-from vdgs.config.serialization import field_hints
+from vdgs.config.type_hints import field_hints
 from vdgs.errors import VdgsError
 
 #: More than anything that is counted: iterations, anchors, photographs.

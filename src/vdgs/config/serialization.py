@@ -7,10 +7,13 @@ import difflib
 import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any
+
+from vdgs.config.number_words import how_to_write, plain_number
+from vdgs.config.ranges import to_flag
+from vdgs.config.type_hints import describe_type, field_hints, without_notes
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -26,12 +29,6 @@ def to_dict(config: Any) -> dict[str, Any]:
         return str(value)
 
     return plain(dataclasses.asdict(config))
-
-
-@cache
-def field_hints(kind: type) -> dict[str, Any]:
-    """What each field of a config class holds, with its notes: texts of the source, which take long to evaluate."""
-    return typing.get_type_hints(kind, include_extras=True)
 
 
 def diff_settings(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
@@ -54,7 +51,8 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") ->
     """
     hints = field_hints(kind)
     _check_names(values, hints, where)
-    return kind(**{name: _read(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()})
+    inside = {name: f"{where}.{name}".lstrip(".") for name in values}
+    return kind(**{name: _read_words(hints[name], value, inside[name]) for name, value in values.items()})
 
 
 def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -> dict[tuple[str, ...], Any]:
@@ -72,7 +70,7 @@ def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -
             within = flat_values(typing.cast(type, inner), value, inside)
             flat |= {(name, *path): each for path, each in within.items()}
         else:
-            flat[(name,)] = _read(hints[name], value, inside)
+            flat[(name,)] = _read_words(hints[name], value, inside)
     return flat
 
 
@@ -87,6 +85,20 @@ def suggest(word: str, known: Iterable[str]) -> str:
     """`; did you mean 'threshold'?` where a known word is like this one."""
     like = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean {like[0]!r}?" if like else ""
+
+
+def _read_words(hint: Any, value: Any, where: str) -> Any:
+    """A plain value, of which texts are numbers as the command line reads them. Raises ValueError."""
+    flag, said = to_flag((where,)), value
+    if isinstance(value, str):
+        value = plain_number(value, flag, hint)
+    elif isinstance(value, list):
+        value = [plain_number(each, flag, hint) if isinstance(each, str) else each for each in value]
+    try:
+        return _read(hint, value, where)
+    except ValueError as error:
+        how = how_to_write(said, flag, hint) if isinstance(said, str) else ""
+        raise ValueError(f"{error}{how}") from None
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:
@@ -130,24 +142,3 @@ def _whole(number: float) -> int:
     if not number.is_integer():
         raise ValueError
     return int(number)
-
-
-def without_notes(hint: Any) -> Any:
-    """A type without what `Annotated` says beside it."""
-    return typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
-
-
-def describe_type(hint: Any) -> str:
-    """What a value of a type looks like, for people."""
-    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
-    origin = typing.get_origin(kind)
-    if origin is tuple and inner[-1:] == (Ellipsis,):
-        return f"a list, each of it {describe_type(inner[0])}"
-    if origin is tuple:
-        return f"a list of {len(inner)}: {', '.join(map(describe_type, inner))}"
-    if origin in (typing.Union, UnionType):
-        return " or ".join(map(describe_type, inner))
-    if origin is typing.Literal:
-        return " or ".join(map(str, inner))
-    named = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
-    return named.get(kind, "null")

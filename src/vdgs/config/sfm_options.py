@@ -11,6 +11,8 @@ from vdgs.config.ranges import MAX_COUNT, WORKER_COUNT, FlagName, Range
 
 CameraModel = Literal["auto", "simple-radial", "opencv", "opencv-fisheye", "equirectangular"]
 
+Brackets = Literal["middle", "all"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SfmOptions:
@@ -24,6 +26,9 @@ class SfmOptions:
     """How lenses bend. auto: one radial term, a fisheye's four where EXIF's name of the lens says so, and panoramas of
     360° by their XMP; opencv: two radial and two tangential terms; equirectangular: every photograph twice as wide as
     high is a panorama of 360°."""
+    brackets: Brackets = "middle"
+    """Which exposures of a bracket (AEB) are used. middle: the middle one of those of one place and moment, by EXIF;
+    all: every photograph."""
     num_neighbors: Annotated[int, Range(2, 1000)] = 16
     """Neighbors that each photograph is matched with. Where positions are known; more where neighbors show
     little of the same: facades, oblique views, several cameras at one place."""

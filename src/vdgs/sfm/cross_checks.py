@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs.captures.image_files import open_image, same_aspect
+from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import Lens, unzoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
@@ -43,6 +44,7 @@ _SAME_MOMENT = timedelta(seconds=2)
 _PREFERRED = ("panchro", "green", "red", "blue")
 #: Fewer color photographs than this share of the exposures are none of the set.
 _COLOR_SHARE = 0.5
+_FLAT = "that the receiver measured no altitude (GPSMeasureMode 2)"
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)
 
@@ -55,9 +57,30 @@ def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
     changed = {
         photo.name: photo
         for group in groups.values()
-        for photo in _without_defaults(_one_altitude(_cropped(_zoom_once(group))))
+        for photo in _without_defaults(_one_altitude(_cropped(_zoom_once(_without_void(group)))))
     }
     return [changed[photo.name] for photo in photographs]
+
+
+def _without_void(group: list[ImageMetadata]) -> list[ImageMetadata]:
+    """Without positions that EXIF calls void and altitudes that it calls not measured. A receiver without them repeats
+    the last: where all photographs of a camera say so and the values differ, the tag is a default."""
+    found = group
+    for fix, what, tag in ((VOID, "lat_lon", "a void position (GPSStatus V, or GPSDOP)"), (FLAT, "altitude", _FLAT)):
+        members = [photo for photo in group if photo.fix == fix and getattr(photo, what) is not None]
+        if not members:
+            continue
+        moving = len({getattr(photo, what) for photo in members}) > len(members) / 2
+        default = len(members) == len(group) >= LEAST_ALIKE and moving
+        doubt = f"EXIF says {tag}" + (
+            ", but of all photographs of this camera, and the values differ: used" if default else "; not used"
+        )
+        values = {} if default else {what: None}
+        names = {photo.name for photo in members}
+        found = [
+            replace(photo, doubts=(*photo.doubts, doubt), **values) if photo.name in names else photo for photo in found
+        ]
+    return found
 
 
 def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:

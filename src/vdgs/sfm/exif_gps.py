@@ -36,6 +36,12 @@ _GLOBAL_DATUMS = re.compile(
 #: Altitudes that differ by less (metres) are the same number.
 SAME_M = 0.01
 
+#: A receiver's dilution of precision: above the first, errors are that many times as large as usual (choice: the usual
+#: tables call it moderate to fair); from the second on there was no fix (receivers write 50 and 99.99 then).
+POOR_DILUTION, NO_FIX = 6.0, 50.0
+#: Fixes that are none, and those without altitude.
+VOID, FLAT = "void", "flat"
+
 Place = tuple[float, float]
 #: Metres, None where they are not known, and what they are measured from.
 Altitude = tuple[float | None, str]
@@ -64,7 +70,7 @@ def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | 
     EXIF's block comes first. XMP fills what the block lacks, a place or its side of the Earth. Where the two are
     different places neither is believed.
     """
-    in_xmp = _place_in_xmp(xmp)
+    in_xmp = place_in_xmp(xmp)
     if gps.get(2) is None and gps.get(4) is None:
         return in_xmp, ""
     found = {axis: _angle(gps, axis) for axis in _TAGS}
@@ -102,6 +108,21 @@ def other_datum(gps: Mapping[int, Any]) -> str:
         f"EXIF says that positions are of the datum {datum}: taken as of WGS 84, from which it may differ by some "
         "hundred metres (a table of positions, --gps, whose first line names the system, mends it)"
     )
+
+
+def read_fix(gps: Mapping[int, Any]) -> str:
+    """What EXIF says against a position: `VOID` where the receiver had none (GPSStatus V, a dilution of a receiver
+    without satellites), `FLAT` where it measured no altitude (GPSMeasureMode 2); empty else."""
+    status, mode = (plain_text(gps.get(tag)).strip("\x00 ").upper() for tag in (9, 10))
+    if status.startswith("V") or (finite(gps.get(11)) or 0.0) >= NO_FIX:
+        return VOID
+    return FLAT if mode == "2" else ""
+
+
+def dilution(gps: Mapping[int, Any]) -> float | None:
+    """GPSDOP where it is poor."""
+    value = finite(gps.get(11))
+    return value if value is not None and POOR_DILUTION < value < NO_FIX else None
 
 
 def read_altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> Altitude:
@@ -189,7 +210,8 @@ def _is_infinite(value: Any) -> bool:
     return getattr(value, "denominator", 1) == 0 and numerator not in (0, None) and not math.isnan(numerator)
 
 
-def _place_in_xmp(xmp: Mapping[str, str]) -> Place | None:
+def place_in_xmp(xmp: Mapping[str, str]) -> Place | None:
+    """Latitude and longitude in degrees."""
     read = []
     for axis, names in _XMP.items():
         angle = degrees_of_text(text(xmp, *names), axis)

@@ -18,8 +18,9 @@ from vdgs.captures.output_guard import is_capture
 from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk
-from vdgs.config.sfm_options import CameraModel
+from vdgs.config.sfm_options import Brackets, CameraModel
 from vdgs.errors import CaptureError
+from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked, strays, unused_bands
 from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
@@ -55,8 +56,10 @@ class ImageList:
     """What people should know of their masks."""
 
 
-def collect_images(folders: Sequence[Path], camera_model: CameraModel = "auto") -> ImageList:
-    """Read the heads of all photographs in the folders and those below them; `camera_model` is as in `SfmOptions`.
+def collect_images(
+    folders: Sequence[Path], camera_model: CameraModel = "auto", brackets: Brackets = "middle"
+) -> ImageList:
+    """Read the heads of all photographs in the folders and those below them; the others are as in `SfmOptions`.
 
     Raises CaptureError for folders that are not there or hold no photographs, captures, names that are alike but for
     blanks, masks that belong to nothing, and where too few are usable.
@@ -95,10 +98,12 @@ def collect_images(folders: Sequence[Path], camera_model: CameraModel = "auto") 
     photographs, doubled = _drop_duplicates(photographs)
     unused, spectral = unused_bands(photographs)
     photographs, strange = _of_the_flight([photo for photo in photographs if photo.name not in unused])
-    photographs, lone = _with_models(photographs, camera_model)
+    exposures, bracketed = unused_exposures(photographs) if brackets == "middle" else ({}, [])
+    unused |= exposures
+    photographs, lone = _with_models([photo for photo in photographs if photo.name not in exposures], camera_model)
     photographs, rigs = with_sensors(photographs)
     left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
-    notes = [*found.notes(), *notes, *spectral, *rigs, *_kind_notes(photographs)]
+    notes = [*found.notes(), *notes, *spectral, *bracketed, *rigs, *_kind_notes(photographs)]
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
         reasons = format_list(f"{each.name}: {each.reason}" for each in left_out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,17 @@ from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES
 from vdgs.captures.image_tags import ImageTags, read_tags
 from vdgs.captures.jpeg import lacks_only_end
 from vdgs.errors import CaptureError
-from vdgs.sfm.exif_gps import Altitude, finite, other_datum, plain_text, read_altitudes, read_place
+from vdgs.sfm.exif_gps import (
+    Altitude,
+    dilution,
+    finite,
+    other_datum,
+    place_in_xmp,
+    plain_text,
+    read_altitudes,
+    read_fix,
+    read_place,
+)
 from vdgs.sfm.focal_length import Lens, read_lens
 from vdgs.sfm.spectral_bands import band_of
 from vdgs.sfm.xmp import first_number, read_xmp, text
@@ -178,6 +189,12 @@ class ImageMetadata:
     """The folder of its camera in a rig (`rig1/cam0/`); empty for cameras on their own."""
     altitudes: tuple[Altitude, Altitude] | None = None
     """EXIF's and XMP's, where these differ."""
+    exposure_bias: float | None = None
+    """In stops, as it was chosen (EXIF's ExposureBiasValue)."""
+    exposure_stops: float | None = None
+    """Light that counts, in stops: exposure time and sensitivity."""
+    fix: str = ""
+    """What EXIF says against its position or altitude: `VOID`, `FLAT`; empty for nothing."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 
@@ -253,6 +270,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         altitudes=both,
         gps_std=_stated_std(xmp),
         gps_error_m=_gps_error(gps),
+        fix="" if place_in_xmp(xmp) else read_fix(gps),
         relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
         attitude=attitude if orientation == 1 else None,
         file_bytes=size,
@@ -263,6 +281,8 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         band=band_of(name, found.mode, xmp),
         camera_model=FISHEYE if _is_fisheye(details, xmp) else RADIAL,
         is_panorama=panorama,
+        exposure_bias=finite(details.get(0x9204)),
+        exposure_stops=_exposure_stops(details),
         frame=name,
     )
 
@@ -337,6 +357,15 @@ def _stated_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
 
 
 def _gps_error(gps: Mapping[int, Any]) -> float | None:
-    """EXIF's GPSHPositioningError in metres; 0 and kilometres say nothing."""
+    """EXIF's GPSHPositioningError in metres, of which 0 and kilometres say nothing; else a poor dilution of precision:
+    metres, of a receiver that is good to a metre, as is assumed where nothing is stated."""
     value = finite(gps.get(0x1F))
-    return value if value is not None and 0 < value < MAX_GPS_ERROR_M else None
+    return value if value is not None and 0 < value < MAX_GPS_ERROR_M else dilution(gps)
+
+
+def _exposure_stops(details: Mapping[int, Any]) -> float | None:
+    """Exposure time and sensitivity in stops; the aperture of drones stays as it is within seconds."""
+    sensitivity = details.get(0x8827)
+    sensitivity = sensitivity[0] if isinstance(sensitivity, tuple | list) and sensitivity else sensitivity
+    seconds, iso = finite(details.get(0x829A)), finite(sensitivity) or 100.0
+    return math.log2(seconds * iso) if seconds and seconds > 0 and iso > 0 else None

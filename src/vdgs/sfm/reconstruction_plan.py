@@ -61,7 +61,7 @@ class ReconstructionPlan:
 def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
     """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
     check_ranges(request)
-    collection = collect_images(request.image_folders, request.options.camera_model)
+    collection = collect_images(request.image_folders, request.options.camera_model, request.options.brackets)
     check_output_outside_images(request.output, collection)
     request, beside = _with_tables_beside(request, collection)
     _check_marks(request.options, collection)

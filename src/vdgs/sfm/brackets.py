@@ -1,0 +1,107 @@
+"""Photographs of one view in several exposures (brackets, AEB), of which the middle one is used."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.sfm.flights import time_of
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.system.units import first_names
+
+#: A bracket's photographs follow each other within so many seconds and metres (choice).
+NEXT_S, NEXT_M = 2.0, 2.0
+#: Exposures nearer than this (stops) are one exposure; steps of a bracket differ by less.
+SAME_STOPS = 0.2
+#: A camera that takes brackets takes some of so many exposures at least, and none of more.
+LEAST, MOST = 3, 9
+#: Without a bias in EXIF exposures must span so many stops, and such brackets be so much of all (choice): automatic
+#: exposure varies, too.
+LEAST_SPAN, LEAST_SHARE = 1.0, 0.5
+
+Bracket = list[ImageMetadata]
+
+
+def unused_exposures(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], list[str]]:
+    """The photographs of brackets that are not used, with the reason, and what people should know of them."""
+    cameras: dict[tuple[str, str, tuple[int, int]], Bracket] = {}
+    for photo in photographs:
+        cameras.setdefault((str(PurePosixPath(photo.name).parent), photo.camera, photo.size), []).append(photo)
+    left, used, sizes = dict[str, str](), list[str](), Counter[int]()
+    for taken in cameras.values():
+        taken.sort(key=lambda photo: (photo.datetime, photo.name))
+        brackets = _by_bias(taken)
+        by_bias = bool(brackets)
+        brackets = brackets or _by_stops(taken)
+        usual = Counter(sorted(map(_bias, each))[len(each) // 2] for each in brackets if len(each) % 2)
+        for bracket in brackets:
+            values = [_bias(photo) if by_bias else _stops(photo) for photo in bracket]
+            aim = usual.most_common(1)[0][0] if by_bias and usual else float(np.median(values))
+            middle = bracket[int(np.abs(np.subtract(values, aim)).argmin())]
+            used.append(middle.name)
+            sizes[len(bracket)] += 1
+            for photo, value in zip(bracket, values, strict=True):
+                if photo is not middle:
+                    how = f"{value - aim:+.1f} stops"
+                    left[photo.name] = f"is of one bracket with {middle.name}, whose exposure is the middle one ({how})"
+    if not used:
+        return left, []
+    kinds = " and ".join(f"{number} of {size}" for size, number in sorted(sizes.items()))
+    return left, [
+        f"{first_names(used)}: exposures of brackets (AEB: {kinds}); the middle one of each is used, the other "
+        f"{len(left)} are left out. To use all: --brackets all."
+    ]
+
+
+def _bias(photo: ImageMetadata) -> float:
+    return np.nan if photo.exposure_bias is None else photo.exposure_bias
+
+
+def _stops(photo: ImageMetadata) -> float:
+    return np.nan if photo.exposure_stops is None else photo.exposure_stops
+
+
+def _by_bias(taken: Bracket) -> list[Bracket]:
+    """Brackets by EXIF's exposure bias, also those that lack an exposure, where one is whole."""
+    found = _runs(taken, [_bias(photo) for photo in taken])
+    return found if any(len(each) >= LEAST for each in found) else []
+
+
+def _by_stops(taken: Bracket) -> list[Bracket]:
+    """Brackets by the exposure itself, in equal steps."""
+    found = []
+    for run in _runs(taken, [_stops(photo) for photo in taken]):
+        steps = np.diff(sorted(_stops(photo) for photo in run))
+        if len(run) >= LEAST and len(run) % 2 and steps.sum() >= LEAST_SPAN and np.ptp(steps) < SAME_STOPS:
+            found.append(run)
+    return found if sum(map(len, found)) >= LEAST_SHARE * len(taken) else []
+
+
+def _runs(taken: Bracket, values: Sequence[float]) -> list[Bracket]:
+    """Photographs that follow each other at one place, each of another exposure; two or more."""
+    runs: list[list[int]] = []
+    for index, value in enumerate(values):
+        run = runs[-1] if runs else []
+        other = bool(run) and all(abs(value - values[k]) > SAME_STOPS for k in run)  # false for NaN
+        if other and len(run) < MOST and _is_next(taken[run[-1]], taken[index]):
+            run.append(index)
+        else:
+            runs.append([index])
+    return [[taken[k] for k in run] for run in runs if len(run) > 1]
+
+
+def _is_next(before: ImageMetadata, photo: ImageMetadata) -> bool:
+    """Whether a photograph was taken right after another and where that was, as far as either is known; one must be."""
+    moments, places = (time_of(before.datetime), time_of(photo.datetime)), (before.lat_lon, photo.lat_lon)
+    known = [each is not None for each in moments], [each is not None for each in places]
+    if moments[0] and moments[1] and (moments[1] - moments[0]).total_seconds() > NEXT_S:
+        return False
+    if places[0] and places[1]:
+        away = enu_from_geodetic(np.array([[*places[1], 0.0]]), (*places[0], 0.0))[0]
+        if np.linalg.norm(away) > NEXT_M:
+            return False
+    return all(known[0]) or all(known[1])

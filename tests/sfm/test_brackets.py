@@ -1,0 +1,100 @@
+"""Exposures of brackets, and fixes that EXIF itself does not vouch for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from support.flights import write_photograph
+from vdgs.sfm.brackets import unused_exposures
+from vdgs.sfm.cross_checks import cross_checked
+from vdgs.sfm.exif_gps import FLAT, VOID
+from vdgs.sfm.image_list import collect_images
+from vdgs.sfm.image_metadata import ImageMetadata, read_image_metadata
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+
+
+def tagged(file: Path, number: int, east: float, details: dict[int, object], gps: dict[int, object]) -> ImageMetadata:
+    write_photograph(file, np.roll(NOISE, number, axis=0), number, np.array((east, 0, 40)))
+    with Image.open(file) as image:
+        exif = image.getexif()
+        exif.get_ifd(0x8769).update(details)
+        exif.get_ifd(0x8825).update(gps)
+        image.save(file, exif=exif)
+    return read_image_metadata(file, file.name)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory) -> ImageMetadata:
+    return tagged(tmp_path_factory.mktemp("one") / "p.jpg", 0, 0, {0x9204: -0.7, 0x829A: 0.01, 0x8827: 200}, {})
+
+
+def shots(first: ImageMetadata, biases: list[float | None], every_s: int = 1, step_m: float = 0.3, each: int = 3):
+    """Photographs of which `each` follow at once, and places 15 m apart."""
+    found = []
+    for k, bias in enumerate(biases):
+        seconds, east = 20 * (k // each) + every_s * (k % each), 15 * (k // each) + step_m * (k % each)
+        found.append(
+            replace(
+                first, name=f"p{k:03d}.jpg", exposure_bias=bias, lat_lon=(-33.5, -70.6 + east / 92800),
+                datetime=f"2026:06:01 10:{seconds // 60:02d}:{seconds % 60:02d}",
+            )
+        )  # fmt: skip
+    return found
+
+
+def test_one_photograph_of_each_bracket_is_used_and_the_others_are_named(tmp_path, first):
+    assert first.exposure_bias == pytest.approx(-0.7)
+    assert first.exposure_stops == pytest.approx(1)
+    for k in range(9):
+        tagged(tmp_path / f"p{k}.jpg", k, 20 * (k // 3) + 0.1 * k, {0x9204: (0.0, -0.7, 0.7)[k % 3]}, {})
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == ["p0.jpg", "p3.jpg", "p6.jpg"]
+    assert "one bracket with p3.jpg" in found.excluded[2].reason
+    assert any("3 of 3" in note and "other 6" in note and "--brackets all" in note for note in found.notes)
+    assert len(collect_images([tmp_path], brackets="all").images) == 9
+
+
+def test_brackets_of_five_of_lost_exposures_and_of_manual_cameras_are_found(first):
+    five = shots(first, [0, -0.7, 0.7, -1.3, 1.3] * 4, each=5)
+    assert len(unused_exposures(five)[0]) == 16
+    del five[7], five[0]  # an exposure is lost, even the middle one
+    left, _ = unused_exposures(five)
+    assert len(left) == 14
+    assert {"p005.jpg", "p010.jpg", "p015.jpg"}.isdisjoint(left)
+    by_time = [replace(p, exposure_stops=(-6.0, -7.5, -4.5)[k % 3]) for k, p in enumerate(shots(first, [0.0] * 9))]
+    assert len(unused_exposures(by_time)[0]) == 6
+    without_place = [replace(photo, lat_lon=None) for photo in shots(first, [0, -1, 1] * 3)]
+    assert len(unused_exposures(without_place)[0]) == 6
+    assert not unused_exposures([replace(photo, datetime="") for photo in without_place])[0]
+
+
+def test_photographs_that_merely_are_dense_stay(first):
+    assert unused_exposures(shots(first, [0.0] * 30, each=30))[0] == {}
+    assert unused_exposures(shots(first, [0, 0, 0, -0.3, -0.3, -0.3], each=6))[0] == {}  # the pilot chose another
+    assert unused_exposures(shots(first, [0, -1, 1] * 3, step_m=8.0))[0] == {}
+    assert unused_exposures(shots(first, [0, -1, 1] * 3, every_s=5))[0] == {}
+    rng = np.random.default_rng(1)  # automatic exposure while the drone hovers
+    for size in (0.1, 0.5, 1.0):
+        auto = [replace(p, exposure_stops=float(rng.normal(0, size))) for p in shots(first, [0.0] * 90, each=90)]
+        assert unused_exposures(auto)[0] == {}
+
+
+def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_is_a_default(tmp_path):
+    tags: list[dict[int, object]] = [{9: "A", 10: "3"}, {9: "V"}, {10: "2"}, {11: 99.9}, {11: 12.0}]
+    read = [tagged(tmp_path / f"p{k}.jpg", k, 10.0 * k, {}, gps) for k, gps in enumerate(tags)]
+    assert [photo.fix for photo in read] == ["", VOID, FLAT, VOID, ""]
+    assert [photo.gps_error_m for photo in read] == [None] * 4 + [12.0]
+    checked = cross_checked(read)
+    assert [photo.lat_lon is None for photo in checked] == [False, True, False, True, False]
+    assert [photo.altitude is None for photo in checked] == [False, False, True, False, False]
+    assert "void position" in checked[1].doubts[-1]
+    everywhere = cross_checked([replace(photo, fix=VOID) for photo in read])
+    assert all(photo.lat_lon and "used" in photo.doubts[-1] for photo in everywhere)
+    stale = cross_checked([replace(photo, fix=VOID, lat_lon=read[0].lat_lon) for photo in read])
+    assert not any(photo.lat_lon for photo in stale)
