@@ -176,10 +176,9 @@ def test_a_number_that_yaml_takes_for_text_is_still_one():
         assert from_dict(MethodConfig, {"training": {"seed": said}}).training.seed == number
     for said, iterations in (("30k", 30_000), ("30,000", 30_000), ("2.5k", 2500)):
         assert from_dict(MethodConfig, {"training": {"iterations": said}}).training.iterations == iterations
-    block = from_dict(
-        MethodConfig, {"block": {"densify": {"stop_fraction": "70%"}, "lr": {"offsets": ["1,5", "1e-4"]}}}
-    )
-    assert (block.block.densify.stop_fraction, block.block.lr.offsets) == (0.7, (1.5, 1e-4))
+    words = {"training": {"densify": {"stop_fraction": "70%"}, "lr": {"offsets": ["1,5", "1e-4"]}}}
+    training = from_dict(MethodConfig, words).training
+    assert (training.densify.stop_fraction, training.lr.offsets) == (0.7, (1.5, 1e-4))
     with pytest.raises(ValueError, match=r"'30\.000'; it must be a whole number; write such as 30000, 30k"):
         from_dict(MethodConfig, {"training": {"iterations": "30.000"}})
     for said, word in ((True, "on"), (False, "off"), ("auto", "auto")):  # YAML takes on and off for truth

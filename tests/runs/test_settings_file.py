@@ -104,6 +104,7 @@ def test_a_run_that_is_there_keeps_its_settings(tmp_path):
         ("vdgs: {iterations: 5}", "vdgs has no 'iterations'"),
         ("training: [", "cannot be read as YAML"),
         ("training: {iterations: 5, seed: 1, iterations: 6}", "iterations is given twice"),
+        ("training: {iterations: 30.000}", "write such as 30000, 30k"),
     ],
 )
 def test_a_file_that_does_not_work_is_explained(text, says, tmp_path):

@@ -154,11 +154,16 @@ def test_altitudes_of_flights_that_differ_by_a_datum_tilt_nothing_and_are_said(d
             assert offsets is None
             continue
         assert abs(offsets.different[0]) == pytest.approx(datum_m, abs=2.0)
-        across, up = georegistration._with_datum(fit, offsets, np.ones(36))
+        across, up = georegistration._place_error(fit, offsets, positions, np.arange(36))
         assert (across, up >= datum_m - 2) == (fit.place_error_m[0], True)
         # A flight with RTK beside one without says what is right.
         stated = np.where(flights == flights[~offsets.reference][0], 3.0, 0.02)
-        assert georegistration._with_datum(fit, offsets, stated) == fit.place_error_m
+        one = replace(positions, gps_std=np.repeat(stated[:, None], 3, axis=1))
+        assert georegistration._place_error(fit, offsets, one, np.arange(36)) == fit.place_error_m
+        rounded = replace(one, altitude_step_m=10.0)
+        assert georegistration._place_error(fit, None, rounded, np.arange(36))[1] == pytest.approx(
+            np.hypot(fit.place_error_m[1], 10)
+        )
         assert f"{offsets.different[0]:+.0f} m (18 photographs)" in georegistration._of_offsets(offsets, fit)[0]
 
 

@@ -126,11 +126,9 @@ def _read(hint: Any, value: Any, where: str) -> Any:
     if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4
         with suppress(ValueError):
             return float(value)
-    if kind is int and isinstance(value, (str, float)):  # and 1e3, too
+    if kind is int and isinstance(value, (str, float)):
         with suppress(ValueError):
             return int(value) if isinstance(value, str) else _whole(value)
-        with suppress(ValueError):
-            return _whole(float(value))
     plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
     if plain and (kind is bool or not isinstance(value, bool)):
         return value

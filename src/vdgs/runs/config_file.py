@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 from collections import Counter
@@ -157,6 +158,14 @@ class _Loader(yaml.SafeLoader):
         if twice := [name for name, count in names.items() if count > 1]:
             raise yaml.constructor.ConstructorError(None, None, f"{twice[0]} is given twice", node.start_mark)
         return super().construct_mapping(node, deep)
+
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> Any:
+        """A number, but 30.000 as it is written: where a whole number is asked for, it is thirty thousand to many."""
+        number = super().construct_yaml_float(node)
+        return node.value if re.fullmatch(r"[+-]?\d+\.\d{3}", node.value) else number
+
+
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
 def load_yaml(text: str) -> Any:

@@ -66,20 +66,18 @@ def _without_void(group: list[ImageMetadata]) -> list[ImageMetadata]:
     """Without positions that EXIF calls void and altitudes that it calls not measured. A receiver without them repeats
     the last: where all photographs of a camera say so and the values differ, the tag is a default."""
     found = group
-    for fix, what, tag in ((VOID, "lat_lon", "a void position (GPSStatus V, or GPSDOP)"), (FLAT, "altitude", _FLAT)):
-        members = [photo for photo in group if photo.fix == fix and getattr(photo, what) is not None]
-        if not members:
-            continue
-        moving = len({getattr(photo, what) for photo in members}) > len(members) / 2
-        default = len(members) == len(group) >= LEAST_ALIKE and moving
-        doubt = f"EXIF says {tag}" + (
-            ", but of all photographs of this camera, and the values differ: used" if default else "; not used"
-        )
-        values = {} if default else {what: None}
-        names = {photo.name for photo in members}
-        found = [
-            replace(photo, doubts=(*photo.doubts, doubt), **values) if photo.name in names else photo for photo in found
-        ]
+    for fix, tag in ((VOID, "a void position (GPSStatus V, or GPSDOP)"), (FLAT, _FLAT)):
+        said = {p.name: p.lat_lon if fix == VOID else p.altitude for p in group if p.fix == fix}
+        values = [value for value in said.values() if value is not None]
+        default = len(values) == len(group) >= LEAST_ALIKE and 2 * len(set(values)) > len(values)
+        why = "but of all photographs of this camera, and the values differ: used" if default else "not used"
+        for k, photo in enumerate(found):
+            if said.get(photo.name) is None:
+                continue
+            kept = replace(photo, doubts=(*photo.doubts, f"EXIF says {tag}; {why}"))
+            if not default:
+                kept = replace(kept, lat_lon=None) if fix == VOID else replace(kept, altitude=None)
+            found = [*found[:k], kept, *found[k + 1 :]]
     return found
 
 

@@ -115,8 +115,7 @@ def georegister(
         )
     levelled, offsets = _without_offsets(problem, positions, rows)
     fit, barometer = _best_fit(levelled, taken)
-    if offsets is not None:
-        fit = replace(fit, place_error_m=_with_datum(fit, offsets, positions.gps_std[rows, 2]))
+    fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
@@ -175,7 +174,7 @@ def _without_offsets(
     plane = fit_positions(replace(problem, has_altitudes=False))
     flights, up = positions.flights[rows], positions.gps_std[rows, 2]
     offsets = altitude_offsets(plane.placed, problem.targets, flights, problem.up.deviation_deg, up)
-    if offsets is None:
+    if offsets is None or np.abs(offsets.different).max() <= positions.altitude_step_m:
         return problem, None
     levelled = replace(problem, targets=problem.targets - offsets.by_position[:, None] * [0, 0, 1])
     costs = DRIFT_COSTS * len(offsets.different) * (1 if problem.stated is None else STATED_TIMES)
@@ -183,9 +182,16 @@ def _without_offsets(
     return (levelled, offsets) if better else (problem, None)
 
 
-def _with_datum(fit: PositionFit, offsets: AltitudeOffsets, up_std: np.ndarray) -> tuple[float, float]:
-    """Place across and up: nothing says whose datum is right, unless one flight alone states the accuracy of RTK."""
+def _place_error(
+    fit: PositionFit, offsets: AltitudeOffsets | None, positions: GpsPriors, rows: np.ndarray
+) -> tuple[float, float]:
+    """Place across and up. All altitudes may be rounded the same way; and nothing says whose datum is right, unless one
+    flight alone states the accuracy of RTK."""
     across, up = fit.place_error_m
+    up = float(np.hypot(up, positions.altitude_step_m))
+    if offsets is None:
+        return across, up
+    up_std = positions.gps_std[rows, 2]
     here, others = (np.median(up_std[which]) for which in (offsets.reference, ~offsets.reference))
     if here <= FIXED_M < others:
         return across, up

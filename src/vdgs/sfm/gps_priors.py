@@ -12,7 +12,7 @@ from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_tables import GpsRow, read_gps_table, with_altitudes
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
-from vdgs.sfm.flights import flights_of
+from vdgs.sfm.flights import STEP_M, flights_of
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
 
@@ -28,6 +28,11 @@ MIN_SPREAD_M = 2.0
 FAR_FROM_ZERO_M = 30.0
 #: What altitudes are measured from where none is known.
 ALTITUDE_UNKNOWN = "not recorded; 0 is that of the median point"
+#: What altitudes may be rounded to (metres; feet among them), and from how many positions on that is told; their error
+#: then, as a share of the step (choice: nobody says whether they were rounded or cut off).
+STEPS_M, LEAST_ROUNDED, ROUNDING_ERROR = (100.0, 50.0, 30.48, 20.0, 10.0, 5.0, 3.048, 2.0, 1.0), 8, 1 / 3
+#: Altitudes that are this near to a step (metres) are on it.
+ON_STEP_M = 0.02
 #: Fewer positions fix no scale and no directions.
 MIN_POSITIONS = 3
 #: No receiver is better than this, whatever it writes (metres).
@@ -54,6 +59,8 @@ class GpsPriors:
     """False where most positions have none: then heights here are 0, and positions count in the plane alone."""
     flights: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Numbers [m] of the flights of the positions, whose altitudes may differ by a datum; empty where none is told."""
+    altitude_step_m: float = 0.0
+    """What altitudes are rounded to; 0 where that is not seen."""
 
     def __len__(self) -> int:
         return len(self.image_indices)
@@ -117,14 +124,17 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     deviations = np.array(
         [_position_std(photographs[i], recorded.rows.get(i), table, std_m) for i in index.tolist()]
     ).reshape(-1, 3)
+    step = _altitude_step(geodetic[index, 2]) if has_altitudes else 0.0
+    if step:
+        notes.append(f"altitudes are all multiples of {step:.4g} m: rounded; that counts as their error.")
+        deviations[:, 2] = np.hypot(deviations[:, 2], ROUNDING_ERROR * step)
     kinds = [ALTITUDE_UNKNOWN]
     if has_altitudes:
         kinds = list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
-    flights = flights_of(
-        [photographs[i] for i in index.tolist()], [recorded.kinds[i] for i in index.tolist()], enu[:, 2]
-    )
+    taken, heights = [photographs[i] for i in index.tolist()], None if step >= STEP_M else enu[:, 2]
+    flights = flights_of(taken, [recorded.kinds[i] for i in index.tolist()], heights)
     return GpsPriors(
         image_indices=index,
         enu=enu,
@@ -135,7 +145,15 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         notes=tuple(notes),
         has_altitudes=has_altitudes,
         flights=flights,
+        altitude_step_m=step,
     )
+
+
+def _altitude_step(altitudes: np.ndarray) -> float:
+    """The largest of usual steps that all altitudes [n] are multiples of; 0 where there is none, or all are one."""
+    if len(altitudes) < LEAST_ROUNDED or np.ptp(altitudes) < ON_STEP_M:
+        return 0.0
+    return next((s for s in STEPS_M if np.abs(altitudes - s * np.round(altitudes / s)).max() < ON_STEP_M), 0.0)
 
 
 def _in_space_or_plane(

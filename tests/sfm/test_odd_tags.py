@@ -1,4 +1,4 @@
-"""Exposures of brackets, and fixes that EXIF itself does not vouch for."""
+"""Exposures of brackets, fixes that EXIF itself does not vouch for, altitudes that are rounded."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import pytest
 from PIL import Image
 
 from support.flights import write_photograph
+from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked
 from vdgs.sfm.exif_gps import FLAT, VOID
+from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.image_metadata import ImageMetadata, read_image_metadata
+from vdgs.sfm.incremental_mapper import should_fix_focal
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 
@@ -98,3 +101,23 @@ def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_
     assert all(photo.lat_lon and "used" in photo.doubts[-1] for photo in everywhere)
     stale = cross_checked([replace(photo, fix=VOID, lat_lon=read[0].lat_lon) for photo in read])
     assert not any(photo.lat_lon for photo in stale)
+
+
+@pytest.mark.parametrize(("step", "seen"), [(0.0, 0.0), (1.0, 1.0), (3.048, 3.048), (10.0, 10.0), (30.48, 30.48)])
+def test_rounded_altitudes_count_as_errors_and_do_not_let_the_focal_length_be_fitted(first, step, seen):
+    rng, photos = np.random.default_rng(2), []
+    for k in range(40):
+        altitude = 564.4 + rng.normal(0, 0.8)
+        altitude = step * round(altitude / step) if step else altitude
+        place = -33.5 + 25 * (k // 8) / 111_000, -70.6 + 12 * (k % 8) / 92_800
+        when = f"2026:06:01 10:00:{k:02d}"
+        photo = replace(first, name=f"{k}", lat_lon=place, altitude=altitude, datetime=when, attitude=None)
+        photos.append(replace(photo, relative_altitude=None))
+    priors = read_gps_priors(photos, None, (1.0, 2.0))
+    assert priors.altitude_step_m == seen
+    assert any("multiples" in note for note in priors.notes) is (seen > 0)
+    assert priors.gps_std[0, 2] == pytest.approx(np.hypot(2, seen / 3))
+    assert not np.ptp(priors.flights)
+    assert should_fix_focal(photos, priors, SfmOptions())[0]
+    alike = read_gps_priors([replace(photo, altitude=500.0) for photo in photos], None, (1.0, 2.0))
+    assert alike.altitude_step_m == 0  # one height, as planned
