@@ -18,6 +18,7 @@ from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.image_metadata import ImageMetadata, read_image_metadata
 from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.map_datums import to_wgs84
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 
@@ -101,6 +102,28 @@ def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_
     assert all(photo.lat_lon and "used" in photo.doubts[-1] for photo in everywhere)
     stale = cross_checked([replace(photo, fix=VOID, lat_lon=read[0].lat_lon) for photo in read])
     assert not any(photo.lat_lon for photo in stale)
+
+
+@pytest.mark.parametrize(
+    ("datum", "place", "moved_m", "error_m"),
+    [
+        ("WGS-84", (35.6, 139.7), 0, 0),
+        ("", (35.6, 139.7), 0, 0),
+        ("TOKYO", (35.6, 139.7), 460, 9),
+        ("NAD 27", (40.0, -100.0), 35, 7),
+        ("S-42", (55.0, 37.0), 120, 3),
+        ("ED50", (48.0, 8.0), 125, 1),
+        ("GCJ-02", (30.0, 110.0), 0, 700),
+        ("Beijing 1954", (30.0, 110.0), 0, 300),
+        ("MINE", (30.0, 110.0), 0, 300),
+    ],
+)
+def test_positions_of_another_datum_are_converted_or_their_error_is_stated(datum, place, moved_m, error_m):
+    found, said, error = to_wgs84(place, {0x12: datum})
+    away = np.hypot((found[0] - place[0]) * 111e3, (found[1] - place[1]) * 111e3 * np.cos(np.radians(place[0])))
+    assert (away, error) == (pytest.approx(moved_m, abs=30), error_m)
+    assert (said != "" and datum in said) is (error_m > 0)
+    assert ("converted" in said) is (moved_m > 0)
 
 
 @pytest.mark.parametrize(("step", "seen"), [(0.0, 0.0), (1.0, 1.0), (3.048, 3.048), (10.0, 10.0), (30.48, 30.48)])

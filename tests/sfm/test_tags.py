@@ -14,7 +14,7 @@ from support.flights import add_xmp, write_photograph
 from vdgs.captures.angles import degrees_of_text
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.cross_checks import cross_checked, strays
-from vdgs.sfm.exif_gps import other_datum, read_altitude, read_altitudes, read_place
+from vdgs.sfm.exif_gps import read_altitude, read_altitudes, read_place
 from vdgs.sfm.feature_extraction import group_by_camera
 from vdgs.sfm.focal_length import AGREE, EQUIVALENT, SENSOR, read_lens
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -200,8 +200,6 @@ def test_cut_photographs_have_the_focal_length_of_the_others_in_pixels_and_copie
     copy = replace(seen[0], name="p00 (1).jpg")
     assert list(strays([*seen, copy, replace(copy, name="p00-edited.jpg")])[0]) == ["p00 (1).jpg", "p00-edited.jpg"]
     assert strays([*seen, replace(copy, datetime="2026:06:02 10:00:00")])[0] == {}  # of another moment
-    assert "TOKYO" in other_datum({0x12: "TOKYO", 2: (1, 2, 3)})
-    assert other_datum({0x12: "WGS-84", 2: (1, 2, 3)}) == other_datum({}) == ""
 
 
 def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():

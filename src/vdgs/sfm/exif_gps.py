@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,10 +28,6 @@ _XMP = {
     "longitude": ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude"),
 }  # fmt: skip
 
-#: Datums that agree with WGS 84 to a metre or two.
-_GLOBAL_DATUMS = re.compile(
-    r"WGS[-_ ]*(19)?84|ITRF|ETRS|JGD|CGCS|GDA|NAD[-_ ]*(19)?83|SIRGAS|PZ[-_ ]*90|GRS[-_ ]*(19)?80|KGD|NZGD", re.I
-)
 #: Altitudes that differ by less (metres) are the same number.
 SAME_M = 0.01
 
@@ -96,18 +91,6 @@ def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | 
     if in_xmp is not None and not _same(place, in_xmp):
         return None, f"EXIF and XMP name different places ({_pair(place)}; {_pair(in_xmp)})"
     return place, ""
-
-
-def other_datum(gps: Mapping[int, Any]) -> str:
-    """What people should know of positions that EXIF says to be of a datum that is not within a metre or two of WGS 84;
-    empty elsewhere."""
-    datum = plain_text(gps.get(0x12))
-    if not datum or gps.get(2) is None or _GLOBAL_DATUMS.search(datum):
-        return ""
-    return (
-        f"EXIF says that positions are of the datum {datum}: taken as of WGS 84, from which it may differ by some "
-        "hundred metres (a table of positions, --gps, whose first line names the system, mends it)"
-    )
 
 
 def read_fix(gps: Mapping[int, Any]) -> str:

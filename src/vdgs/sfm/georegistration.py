@@ -185,10 +185,9 @@ def _without_offsets(
 def _place_error(
     fit: PositionFit, offsets: AltitudeOffsets | None, positions: GpsPriors, rows: np.ndarray
 ) -> tuple[float, float]:
-    """Place across and up. All altitudes may be rounded the same way; and nothing says whose datum is right, unless one
-    flight alone states the accuracy of RTK."""
-    across, up = fit.place_error_m
-    up = float(np.hypot(up, positions.altitude_step_m))
+    """Place across and up: all places have the error of their datum, and all altitudes may be rounded the same way. Of
+    two flights nothing says whose altitudes are right, unless one alone states the accuracy of RTK."""
+    across, up = np.hypot(fit.place_error_m, (positions.datum_error_m, positions.altitude_step_m)).tolist()
     if offsets is None:
         return across, up
     up_std = positions.gps_std[rows, 2]

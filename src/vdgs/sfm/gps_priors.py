@@ -59,6 +59,8 @@ class GpsPriors:
     """False where most positions have none: then heights here are 0, and positions count in the plane alone."""
     flights: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Numbers [m] of the flights of the positions, whose altitudes may differ by a datum; empty where none is told."""
+    datum_error_m: float = 0.0
+    """How far all places may be off by the datum that the photographs name."""
     altitude_step_m: float = 0.0
     """What altitudes are rounded to; 0 where that is not seen."""
 
@@ -146,6 +148,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         has_altitudes=has_altitudes,
         flights=flights,
         altitude_step_m=step,
+        datum_error_m=max((photo.datum_error_m for photo in taken if table is None), default=0.0),
     )
 
 

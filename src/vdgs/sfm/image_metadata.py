@@ -20,7 +20,6 @@ from vdgs.sfm.exif_gps import (
     Altitude,
     dilution,
     finite,
-    other_datum,
     place_in_xmp,
     plain_text,
     read_altitudes,
@@ -28,6 +27,7 @@ from vdgs.sfm.exif_gps import (
     read_place,
 )
 from vdgs.sfm.focal_length import Lens, read_lens
+from vdgs.sfm.map_datums import to_wgs84
 from vdgs.sfm.spectral_bands import band_of
 from vdgs.sfm.xmp import first_number, read_xmp, text
 
@@ -193,6 +193,8 @@ class ImageMetadata:
     """In stops, as it was chosen (EXIF's ExposureBiasValue)."""
     exposure_stops: float | None = None
     """Light that counts, in stops: exposure time and sensitivity."""
+    datum_error_m: float = 0.0
+    """How far the place may be off by the datum that EXIF names."""
     fix: str = ""
     """What EXIF says against its position or altitude: `VOID`, `FLAT`; empty for nothing."""
     frame: str = ""
@@ -253,6 +255,10 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     if orientation in TRANSPOSED_ORIENTATIONS:
         width, height = height, width
     place, unclear = read_place(gps, xmp)
+    in_xmp = place_in_xmp(xmp) is not None
+    datum, datum_error_m = "", 0.0
+    if place is not None and not in_xmp:
+        place, datum, datum_error_m = to_wgs84(place, gps)
     (altitude, altitude_type), both = read_altitudes(gps, xmp)
     attitude, default = read_attitude(xmp)
     return ImageMetadata(
@@ -270,12 +276,13 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         altitudes=both,
         gps_std=_stated_std(xmp),
         gps_error_m=_gps_error(gps),
-        fix="" if place_in_xmp(xmp) else read_fix(gps),
+        datum_error_m=datum_error_m,
+        fix="" if in_xmp else read_fix(gps),
         relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
         attitude=attitude if orientation == 1 else None,
         file_bytes=size,
         has_alpha_channel=found.has_alpha_channel,
-        doubts=tuple(filter(None, (unclear, other_datum(gps), default, lens.doubt if lens else ""))),
+        doubts=tuple(filter(None, (unclear, datum, default, lens.doubt if lens else ""))),
         whole=found.whole,
         kind=found.kind,
         band=band_of(name, found.mode, xmp),

@@ -1,0 +1,71 @@
+"""Positions that EXIF says to be of another datum (GPSMapDatum) than WGS 84."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+from vdgs.sfm.exif_gps import Place, plain_text
+
+#: Datums that agree with WGS 84 to a metre or two.
+_GLOBAL = re.compile(
+    r"WGS[-_ ]*(19)?84|ITRF|ETRS|JGD|CGCS|GDA|NAD[-_ ]*(19)?83|SIRGAS|PZ[-_ ]*90|GRS[-_ ]*(19)?80|KGD|NZGD[-_ ]*20",
+    re.I,
+)
+_NOTHING = re.compile(r"unknown|undefined|none|n/?a|null|0*|-*", re.I)
+#: National datums differ from WGS 84 by up to so many metres, and China's maps, which are shifted on purpose.
+UNKNOWN_M, _SHIFTED = 300.0, ((re.compile(r"GCJ", re.I), 700.0), (re.compile(r"BD[-_ ]?09|BAIDU", re.I), 1300.0))
+#: Words of cameras in place of PROJ's names.
+_NAMES = (
+    (r"S[K]?[-_ ]*(19)?42\b|KRASS?OWSK[IY]|PULKOVO.*", "Pulkovo 1942"), (r"POTSDAM", "DHDN"), (r"TOKYO.*", "Tokyo"),
+    (r"(N(ORTH )?AMERICAN|NAD)[-_ ]*(DATUM)?[-_ ]*(19)?27.*", "NAD27"),
+)  # fmt: skip
+
+
+def to_wgs84(place: Place, gps: Mapping[int, Any]) -> tuple[Place, str, float]:
+    """A place in EXIF as one of WGS 84; what people should know of its datum, and by how many metres it may be off.
+
+    PROJ converts with what it brings along; nothing is downloaded. A place of a datum that it does not know stays.
+    """
+    datum = plain_text(gps.get(0x12))
+    if _NOTHING.fullmatch(datum) or _GLOBAL.search(datum):
+        return place, "", 0.0
+    shifted = next((meters for words, meters in _SHIFTED if words.search(datum)), None)
+    named = next((name for words, name in _NAMES if re.fullmatch(words, datum, re.I)), datum)
+    try:
+        found = None if shifted else _way(named, round(place[0]), round(place[1]))
+    except ImportError:
+        return place, f"{_of(datum, UNKNOWN_M)}; pip install 'vdgs[geo]' converts it", UNKNOWN_M
+    if found is None:
+        error_m = shifted or UNKNOWN_M
+        remedy = "a table of positions, --gps, whose first line names the system, mends it"
+        return place, f"{_of(datum, error_m)}; {remedy}", error_m
+    change, error_m = found
+    longitude, latitude = change.transform(place[1], place[0])
+    return (latitude, longitude), f"positions are of the datum {datum}: converted (good to {error_m:.0f} m)", error_m
+
+
+def _of(datum: str, error_m: float) -> str:
+    return f"positions are of the datum {datum}: taken as of WGS 84 (may be off by {error_m:.0f} m)"
+
+
+@lru_cache(maxsize=64)
+def _way(datum: str, latitude: int, longitude: int) -> tuple[Any, float] | None:
+    """The best way from a datum to WGS 84 near a place, and how good it is in metres; None where PROJ knows none."""
+    import pyproj
+
+    try:
+        crs = pyproj.CRS.from_user_input(datum)
+        if not crs.is_geographic:
+            return None
+        near = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
+        with warnings.catch_warnings():  # of grids that are not at hand: another way is taken
+            warnings.simplefilter("ignore", UserWarning)
+            ways = pyproj.transformer.TransformerGroup(crs, "EPSG:4326", always_xy=True, area_of_interest=near)
+    except pyproj.exceptions.ProjError:
+        return None
+    best = next((way for way in ways.transformers if way.accuracy > 0), None)
+    return None if best is None else (best, float(best.accuracy))
