@@ -243,7 +243,7 @@ def test_transforms_json_is_read_where_it_says_what_a_model_cannot(tmp_path, sce
         assert len(capture.test_views) == 5
     for k in range(7):
         (tmp_path / "images" / f"frame_00{k}.png").unlink()
-    with pytest.raises(CaptureError, match=r"7 of 12 images .* are missing(?s:.)*--format colmap"):
+    with pytest.raises(CaptureError, match=r"7 of 13 images .* are missing(?s:.)*--format colmap"):
         load_capture(tmp_path)
 
 
@@ -472,9 +472,16 @@ def test_matrixcity_pose_folder(tmp_path, scene):
     assert (len(capture.train_views), len(capture.test_views)) == (9, 3)
     assert_sees_the_scene(capture, both)
     np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
+    files = [root / f"transforms_{side}.json" for side in ("train", "test")]
+    contents = [json.loads(file.read_text()) for file in files]
+    contents[1]["frames"].append(contents[0]["frames"][8])
+    files[1].write_text(json.dumps(contents[1]))
+    twice = load_capture(root)
+    assert (len(twice.train_views), len(twice.test_views)) == (8, 4)
+    assert any("0008.png: in the training file and in the test file" in warning for warning in twice.warnings)
     for k in range(7):
         (tmp_path / "aerial" / "train" / "block_1" / f"000{k}.png").unlink()
-    with pytest.raises(CaptureError, match=r"7 of 12 images .* are missing(?s:.)*0003\.png(?s:.)*Unpack the \.tar"):
+    with pytest.raises(CaptureError, match=r"7 of 13 images .* are missing(?s:.)*0003\.png(?s:.)*Unpack the \.tar"):
         load_capture(root)
 
 

@@ -111,10 +111,25 @@ class TestWithCards:
         monkeypatch.setattr(device_selection, sign, tmp_path)
         assert select_device("auto") == SelectedDevice("cuda:0", "there is a card that can be used")
 
-    def test_processes_share_all_cards_but_where_another_than_the_first_is_asked_for(self):
-        assert device_selection.cards_of("cuda:0") == {"cuda:0": 8 * 10**9, "cuda:1": 8 * 10**9}
-        assert device_selection.cards_of("cuda:1") == {"cuda:1": 8 * 10**9}
+    def test_processes_share_all_cards_but_where_one_is_asked_for_by_its_number(self):
+        both = {"cuda:0": 8 * 10**9, "cuda:1": 8 * 10**9}
+        assert device_selection.cards_of(select_device("cuda").device) == both
+        for card in both:
+            assert device_selection.cards_of(select_device(card).device) == {card: 8 * 10**9}
         assert device_selection.cards_of("cpu") == {}
+
+    def test_cards_that_torch_cannot_use_are_left_out_and_named(self, monkeypatch):
+        old, new = GpuInfo(0, "Old", 4 * 10**9, (5, 2)), GpuInfo(1, "New", 8 * 10**9, (8, 9))
+        monkeypatch.setattr(driver, "get_cuda_driver", lambda: SimpleNamespace(list_gpus=lambda: [old, new]))
+        monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: ["sm_75", "sm_80", "sm_90a", "compute_120"])
+        device = select_device("cuda").device
+        assert (device, device_selection.cards_of(device)) == ("cuda:1", {"cuda:1": 8 * 10**9})
+        assert "card 0 (Old) is not used: this torch" in device_selection.cards_left_out(device)[0]
+        assert device_selection.cards_left_out("cuda:1") == []
+        with pytest.raises(DeviceUnavailable, match=r"not built for its capability, 5\.2"):
+            select_device("cuda:0")
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+        assert "torch sees 1 card only" in device_selection.cards_left_out(device)[1]
 
     def test_a_card_that_is_not_there(self):
         with pytest.raises(DeviceUnavailable, match="no card 2; the driver knows 2"):

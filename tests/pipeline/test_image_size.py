@@ -19,7 +19,7 @@ from vdgs.config.commands import RunRequest
 from vdgs.config.method import block_train_config
 from vdgs.config.presets import PRESETS
 from vdgs.errors import Interrupted
-from vdgs.pipeline import dry_run, image_size, time_estimate
+from vdgs.pipeline import dry_run, image_size, run_estimate, time_estimate
 from vdgs.pipeline.image_size import ImageSize, choose_image_size, image_sizes, largest_suitable
 from vdgs.pipeline.time_estimate import Growth, StepTimes, measure_textures
 from vdgs.runs.run_folder import RunFolder
@@ -186,11 +186,19 @@ def test_the_choice_and_the_dry_run_have_one_estimate(capture, tmp_path, monkeyp
     loaded = []
     monkeypatch.setattr(image_size, "read_files", lambda *given: loaded.append(given) or read_files(*given))
     monkeypatch.setattr(dry_run, "load_capture", lambda *given: pytest.fail("read twice"))
+    asked = []
+    estimate_at = run_estimate.estimate_at
+    monkeypatch.setattr(image_size, "estimate_at", lambda *given: asked.append(given) or estimate_at(*given))
     estimate = dry_run.estimate_run(request(capture, tmp_path / "run"), make_console())
     chosen, *_, whole = (line for line in capsys.readouterr().out.splitlines() if " processor time)" in line)
     assert estimate.text() in chosen
     assert estimate.text() in whole
     assert len(loaded) == 1
+    scene, probed, *rest = asked[-1]
+    plain, leveled = (run_estimate.estimate_at(scene, replace(probed, has_levels=has), *rest) for has in (False, True))
+    assert leveled.anchors == pytest.approx(1.7 * plain.anchors, abs=1)
+    assert leveled.coarse_bytes > plain.coarse_bytes
+    assert leveled.times["coarse"].seconds == pytest.approx(1.1 * plain.times["coarse"].seconds)
 
 
 @pytest.mark.parametrize(("seconds", "size"), [(6000.0, 800), (24000.0, 400)])

@@ -141,9 +141,19 @@ def test_altitudes_and_their_references(gps, altitude):
 
 @pytest.mark.parametrize(
     ("text", "degrees"),
-    [("-33.5", -33.5), ("33,5", 33.5), ("+0.1", 0.1), ("N 33 30 0", 33.5), ("33 minutes", 33), ("x", None), ("", None)],
+    [
+        ("-33.5", -33.5),
+        ("33,5", 33.5),
+        ("+0.1", 0.1),
+        ("N 33 30 0", 33.5),
+        ("33 minutes", 33),
+        ("x", None),
+        ("", None),
+        ("50%", None),
+    ],
 )
 def test_angles_are_read_from_text(text, degrees):
+    assert degrees_of_text(f"{text}%", "latitude") is None
     read = degrees_of_text(text, "latitude")
     assert (read and read[0]) == (degrees if degrees is None else pytest.approx(degrees))
 

@@ -12,6 +12,8 @@ _NUMBER = re.compile(r"\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _POINTS, _NMEA = re.compile(r"([+-]?\d{1,3})\.(\d{1,2})\.(\d{1,2}(?:\.\d+)?)"), re.compile(r"(\d{2,3})(\d\d\.\d+)")
 #: Words that degrees, minutes and seconds may be written with.
 _UNITS = re.compile(r"degrees?|deg|minutes?|min|seconds?|sec", re.IGNORECASE)
+#: Signs of other things than angles.
+_OTHER_SIGNS = re.compile(r"[%$€#*@!?=<>/|&~^]")
 #: First letters of the words for south and west, north and east, in the axis that they belong to.
 SIDES = {"latitude": ("S", "N"), "longitude": ("W", "E")}
 #: The largest value of each, in degrees.
@@ -46,7 +48,7 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     """
     plain = _UNITS.sub(" ", unicodedata.normalize("NFKC", text.replace("\u00ba", " "))).strip()
     letters = re.findall(r"[A-Za-z]+", re.sub(r"\d[eE][+-]?\d", "00", plain))
-    if len(letters) > 1:
+    if len(letters) > 1 or _OTHER_SIGNS.search(plain):
         return None
     side = side_of(letters[0], axis) if letters else None
     if letters and side is None:

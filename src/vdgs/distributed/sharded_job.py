@@ -35,7 +35,7 @@ from vdgs.distributed.resource_allocation import Allocation, MachineResources, S
 from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.errors import RunError, Stopped
 from vdgs.kernels import get_num_threads
-from vdgs.kernels.device_selection import cards_of
+from vdgs.kernels.device_selection import cards_left_out, cards_of
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import lock_folder
@@ -177,7 +177,7 @@ class ShardedJob:
         machine = MachineResources(get_num_threads(), available_memory_bytes(), tuple(cards.values()))
         with select_backend(execution.executor_options, workload, machine, needs.requirements) as backend:
             line = f"{len(shards)} of {total} {kind.plural} to {kind.verb}, {backend.description}"
-            for text in (line, *backend.notes):
+            for text in (line, *backend.notes, *(cards_left_out(execution.device) if cards else ())):
                 console.print(text, highlight=False)
             request = {name: value for name, value in to_dict(self.request).items() if name not in EXECUTION_FIELDS}
             write_json(self.folder / REQUEST, {"worker": self.worker, "request": request})

@@ -5,8 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vdgs.errors import VdgsError
+
+if TYPE_CHECKING:
+    from vdgs.kernels.cuda.driver import GpuInfo
 
 
 class DeviceUnavailable(VdgsError):
@@ -17,6 +21,12 @@ class DeviceUnavailable(VdgsError):
 DRIVER_FOLDER = Path("/proc/driver/nvidia")
 #: Windows' cards within its Linux (WSL 2), which has no such folder.
 WSL_DEVICE = Path("/dev/dxg")
+
+
+class AnyCard(str):
+    """The name of the first card of those that may be used, where nobody asked for one by its number."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True)
@@ -39,9 +49,12 @@ def select_device(device: str) -> SelectedDevice:
         return SelectedDevice("cpu", "this machine has no NVIDIA GPU")
     index = int(named.group(1) or 0)
     reason = _no_card(index)
+    if reason and not named.group(1):
+        index = next((card.index for card, why in _cards() if not why), index)
+        reason = _no_card(index) if index else reason
     if not reason:
         why = "there is a card that can be used" if device == "auto" else "as asked for"
-        return SelectedDevice(f"cuda:{index}", why)
+        return SelectedDevice(f"cuda:{index}" if named.group(1) else AnyCard(f"cuda:{index}"), why)
     if device == "auto":
         return SelectedDevice("cpu", reason)
     raise DeviceUnavailable(f"--device {device}: {reason}. Use --device cpu, which does everything, or leave it out.")
@@ -49,13 +62,43 @@ def select_device(device: str) -> SelectedDevice:
 
 def cards_of(device: str) -> dict[str, int]:
     """The cards that processes of this machine share where one of them computes on this device, with the bytes of each:
-    all where it is the first card, that one where it is another, none for the CPU."""
-    from vdgs.kernels.cuda.driver import get_cuda_driver
-
+    all that torch can use where nobody asked for one by its number, that one elsewhere, none for the CPU."""
     if not device.startswith("cuda"):
         return {}
-    every = {f"cuda:{card.index}": card.memory_bytes for card in get_cuda_driver().list_gpus()}
-    return {name: size for name, size in every.items() if device in ("cuda", "cuda:0", name)}
+    every = {f"cuda:{card.index}": card.memory_bytes for card, why in _cards() if not why}
+    return {name: size for name, size in every.items() if isinstance(device, AnyCard) or name == device}
+
+
+def cards_left_out(device: str) -> list[str]:
+    """What to say of the cards that are not used because torch cannot."""
+    if not isinstance(device, AnyCard):
+        return []
+    return [f"note: card {card.index} ({card.name}) is not used: {why}" for card, why in _cards() if why]
+
+
+def _cards() -> list[tuple[GpuInfo, str]]:
+    """All cards that the driver shows, each with why torch cannot use it; empty if it can."""
+    from vdgs.kernels.cuda.driver import get_cuda_driver
+    from vdgs.kernels.cuda.nvrtc import CudaUnavailable
+
+    try:
+        return [(card, _unfit(card.index, card.capability)) for card in get_cuda_driver().list_gpus()]
+    except CudaUnavailable:
+        return []
+
+
+def _unfit(index: int, capability: tuple[int, int]) -> str:
+    import torch
+
+    count, archs = torch.cuda.device_count(), torch.cuda.get_arch_list()
+    if 0 < count <= index:
+        return f"torch sees {count} card{'s' if count > 1 else ''} only"
+    found = [re.fullmatch(r"(sm|compute)_(\d+)(\d)\w?", arch) for arch in archs]
+    built = [(each[1], (int(each[2]), int(each[3]))) for each in found if each]
+    # Machine code serves cards of its generation from its own on, PTX all later ones.
+    fits = any(arch <= capability and (kind == "compute" or arch[0] == capability[0]) for kind, arch in built)
+    have = ".".join(map(str, capability))
+    return "" if fits or not built else f"this torch ({torch.__version__}) is not built for its capability, {have}"
 
 
 def _no_card(index: int) -> str:
@@ -72,4 +115,6 @@ def _no_card(index: int) -> str:
 
     if not torch.cuda.is_available():
         return f"this torch ({torch.__version__}) is built without CUDA or does not fit the driver"
-    return "" if index < count else f"there is no card {index}; the driver knows {count}"
+    if index >= count:
+        return f"there is no card {index}; the driver knows {count}"
+    return next((why for card, why in _cards() if card.index == index), "")

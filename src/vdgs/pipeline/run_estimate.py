@@ -25,6 +25,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_num_threads
 from vdgs.kernels.device_selection import cards_of
 from vdgs.model.initialization.initialize import initialize_anchors
+from vdgs.model.levels import fit_levels
 from vdgs.partition.partition_scene import choose_block_count
 from vdgs.pipeline.dense_points import PIXELS_PER_POINT
 from vdgs.pipeline.time_estimate import (
@@ -64,6 +65,8 @@ START = Cost(START_SECONDS, START_SECONDS)
 MAX_PROBED_PIXELS = 700_000
 #: Share of the points that stereo may add which it finds, where it finds any.
 STEREO_SHARE = 0.5
+#: How many times as many anchors levels of them make, and how many times as long training takes then (measured).
+LEVELS_ANCHORS, LEVELS_TIME = 1.7, 1.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +128,8 @@ class Probe:
     """Processor seconds of the stereo of a photograph."""
     workload: TrainingWorkload
     """Of the coarse stage, from the sparse points alone."""
+    has_levels: bool = False
+    """Whether anchors have levels."""
 
 
 def probe(scene: Scene, method: MethodConfig, request: RunRequest, factors: Sequence[float]) -> Probe:
@@ -152,7 +157,8 @@ def probe(scene: Scene, method: MethodConfig, request: RunRequest, factors: Sequ
     if _dense_room(scene, config, min(factors)):
         with ImageCache(capture.train_views, budget) as images:
             stereo = time_stereo(capture, images, config.init)
-    return Probe(steps=steps, textures=textures, stereo=stereo, workload=workload)
+    levels = fit_levels(scene.timed.points, scene.cameras, config.model.levels)
+    return Probe(steps=steps, textures=textures, stereo=stereo, workload=workload, has_levels=bool(levels))
 
 
 def _growth(
@@ -171,16 +177,17 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
     cameras, texture = _shrunk(scene.cameras, factor), probed.textures[factor]
     growth = _growth(scene, probed.workload, config, factor, texture)
     dense = _dense_room(scene, config, factor)
+    more, longer = (LEVELS_ANCHORS, LEVELS_TIME) if probed.has_levels else (1.0, 1.0)
     stereo = views * probed.stereo if dense else 0.0
     share = scene.points / max(1, len(scene.timed.points))
     images_bytes = decoded_image_bytes(cameras)
     sparse = replace(
         probed.workload,
-        anchors=round(share * probed.workload.anchors),
+        anchors=round(share * more * probed.workload.anchors),
         pixels=max_image_pixels(cameras, config.resolution_schedule),
         image_cache_bytes=min(images_bytes, image_cache_bytes(request.checkpointing)),
     )
-    need = replace(sparse, anchors=sparse.anchors + dense)
+    need = replace(sparse, anchors=sparse.anchors + round(more * dense))
     free = available_memory_bytes()
     pixels = max_image_pixels(cameras, method.block.resolution_schedule)
     blocks = choose_block_count(need.max_grown_anchors, views, pixels, method)
@@ -190,17 +197,18 @@ def estimate_at(scene: Scene, probed: Probe, method: MethodConfig, request: RunR
         shards=blocks, shard_bytes=block_bytes, jobs=request.jobs, image_gb=request.checkpointing.image_cache_gb,
         images_bytes=images_bytes,
     )  # fmt: skip
-    cards = tuple(cards_of(request.device).values())
+    is_local = request.executor_options.executor == "local"  # jobs of Ray and SLURM run on cards of other machines
+    cards = tuple(cards_of(request.device).values()) if is_local else ()
     local = allocate_local(work, MachineResources(get_num_threads(), free, cards))
     block = block_train_config(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     drawn = cameras[0].width * cameras[0].height
     coarse_growth, block_growth = growth.coarse(config), growth.block(config, block)
     start = probed.workload.anchors * growth.more  # of the scene whose steps were timed
     grown = start * coarse_growth
-    block_steps = steps.stage(block, drawn, grown, block_growth)
+    block_steps = steps.stage(block, drawn, grown, block_growth) * longer
     times = {
         "stereo": Cost(stereo / get_num_threads(), stereo),
-        "coarse": steps.stage(config, drawn, start, coarse_growth),
+        "coarse": steps.stage(config, drawn, start, coarse_growth) * longer,
         "blocks": _side_by_side((block_steps + START) * blocks, local),
         **_other_times(scene, steps.step(drawn, grown), request, method.block.mask_moving),
     }

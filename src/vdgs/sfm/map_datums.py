@@ -61,7 +61,7 @@ def _way(datum: str, latitude: int, longitude: int) -> tuple[Any, float] | None:
         crs = pyproj.CRS.from_user_input(datum)
         if not crs.is_geographic:
             return None
-        near = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
+        near: Any = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
         with warnings.catch_warnings():  # of grids that are not at hand: another way is taken
             warnings.simplefilter("ignore", UserWarning)
             ways = pyproj.transformer.TransformerGroup(crs, "EPSG:4326", always_xy=True, area_of_interest=near)

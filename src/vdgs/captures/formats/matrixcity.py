@@ -36,6 +36,7 @@ from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
+from vdgs.system.units import first_names
 
 #: Unit of the pose files in metres.
 POSE_UNIT_M = 100.0
@@ -90,7 +91,12 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
             views.append(view)
             scales.add(scale)
     warnings = _missing(missing, count, root, options.strict)
-    views = one_view_each(views, root, bad)
+    sides = {side: {view.image_path for view in views if view.split == side} for side in ("train", "test")}
+    both = [v.name for v in views if v.split == "train" and v.image_path in sides["test"]]
+    views = one_view_each([view for view in views if view.split == "test" or view.name not in both], root, bad)
+    if both:
+        said = "in the training file and in the test file; only for the test, not for training"
+        warnings += (f"{first_names(both)}: {said}.",)
     warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
     if len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
