@@ -14,6 +14,8 @@ from rich.console import Console
 from experiments.baselines.citygaussian.training import train_citygaussian
 from experiments.baselines.dogs.training import train_dogs
 from experiments.baselines.gaussian_blocks.training import BlockScene, GaussianBlocksConfig, train_scene
+from experiments.baselines.gs2d.run import run_gs2d
+from experiments.baselines.gs2d.surface import Gs2dConfig
 from experiments.baselines.gs3d.run import evaluate_gs3d, gaussians_folder, run_gs3d
 from experiments.baselines.gs3d.schedule import scale_schedule
 from experiments.baselines.gs3d.training import Gs3dConfig
@@ -58,6 +60,10 @@ def gs3d_config(method: MethodConfig) -> Gs3dConfig:
     most = training.densify.max_anchors * training.model.num_offsets
     published = Gs3dConfig(seed=training.seed, background=training.loss.background)
     return scale_schedule(training.iterations, published, most)
+
+
+def _gs2d_config(method: MethodConfig) -> Gs2dConfig:
+    return Gs2dConfig(**vars(gs3d_config(method)))
 
 
 def _anchors(method: MethodConfig, settings: Callable[[int, int, int], OctreeConfig]) -> OctreeConfig:
@@ -115,6 +121,7 @@ def _gaussian_blocks(name: str, train: Callable[[BlockScene], Gaussians]) -> Bas
 #: By the name of the stage, which is that of its folder in the run.
 BASELINES: dict[str, BaselineStage] = {
     "gaussians": BaselineStage(gs3d_config, run_gs3d),
+    "gs2d": BaselineStage(_gs2d_config, run_gs2d, "gaussians"),
     "scaffold": BaselineStage(lambda method: _anchors(method, scaffold_config), run_octree),
     "hug": BaselineStage(_hug, run_hug),
     "octree": BaselineStage(lambda method: _anchors(method, octree_config), run_octree),

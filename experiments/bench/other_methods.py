@@ -45,6 +45,20 @@ OTHER_METHODS = [
         differs=f"background black, as published; {_3DGS_SCHEDULE}",
     ),
     BenchMethod(
+        "2dgs",
+        "2DGS",
+        explicit_gaussians("mean"),
+        ("gs2d",),
+        citation="Huang et al., 2D Gaussian Splatting for Geometrically Accurate Radiance Fields, SIGGRAPH 2024",
+        omissions=(
+            "the intersection of ray and disk: flat Gaussians are projected as those of 3DGS",
+            *_3DGS_LEAVES_OUT,
+        ),
+        adapted="3DGS with flat Gaussians, depth distortion and normal consistency",
+        differs="background of the mean color of the photographs, as ours; distortion is of the logarithms of depths, "
+        f"with weight 1; {_3DGS_SCHEDULE}",
+    ),
+    BenchMethod(
         "scaffold-gs",
         "Scaffold-GS",
         coarse_only,

@@ -46,7 +46,10 @@ def two_floors() -> Gaussians:
 def test_a_browser_without_network_draws_what_we_draw(tmp_path, width, height):
     """On a telephone from as much farther as its window is narrow."""
     gaussians, background = two_floors(), (0.8, 0.75, 0.5)
-    page = InitialView((-1.0, -8.0, 6.0), (0.0, 0.0, 0.0), background, "two floors")
+    page = InitialView(
+        (-1.0, -8.0, 6.0), (0.0, 0.0, 0.0), background, "two floors",
+        count_visibility=lambda places: 3 - (places[:, 0] > 2).int(),
+    )  # fmt: skip
     registry.write_scene(tmp_path / "scene.html", replace(ExportScene.of(gaussians), page=page))
     target, farther = np.array(page.target), max(1.0, height / width)
     pose = look_at_pose(target + farther * (np.array(page.position) - target), target)
@@ -63,4 +66,11 @@ def test_a_browser_without_network_draws_what_we_draw(tmp_path, width, height):
 
         wait_until(lambda: likeness() > 26)
         assert shown.evaluate("document.title") == "two floors"
+        shown.evaluate("document.getElementById('trust').click()")
+        marked = replace(gaussians, sh0=gaussians.sh0.clone())
+        east, yellow = gaussians.means[:, 0] > 2, rgb_to_sh(torch.tensor([[1.0, 0.72, 0.0]]))
+        marked.sh0[east] = 0.4 * marked.sh0[east] + 0.6 * yellow
+        with torch.no_grad():
+            expected = render_gaussians(marked, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
+        wait_until(lambda: likeness() > 26)
         assert shown.evaluate("performance.getEntriesByType('resource').filter(e => /^http/.test(e.name)).length") == 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import sys
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +39,18 @@ def test_a_page_holds_the_scene_in_any_unit(tmp_path, scale):
     camera = overhead(8.0)
     if scale == 1.0:
         assert psnr(picture(read, camera), picture(gaussians, camera)) > 38
+
+
+def test_a_page_says_what_few_cameras_see(tmp_path):
+    gaussians = random_gaussians(1001, 0)
+    seen = torch.arange(1001) % 6
+    page = InitialView((0.0, -20.0, 20.0), (0.0, 0.0, 0.0), count_visibility=lambda places: seen)
+    registry.write_scene(tmp_path / "a.html", replace(ExportScene.of(gaussians), page=page))
+    packed = re.search(r'atob\("([A-Za-z0-9+/=]*)"', (tmp_path / "a.html").read_text())
+    codes = np.frombuffer(zlib.decompress(base64.b64decode(packed[1])), np.uint8)
+    assert [codes[i >> 2] >> 2 * (i & 3) & 3 for i in range(1001)] == [max(0, min(int(v) - 1, 2)) for v in seen]
+    registry.write_scene(tmp_path / "b.html", ExportScene.of(gaussians))
+    assert "trust" not in (tmp_path / "b.html").read_text()
 
 
 def test_what_is_far_larger_than_all_else_is_held_as_large_as_it_can_be(tmp_path):

@@ -96,9 +96,9 @@ def test_without_any_error_the_picture_is_that_of_the_model_to_the_last_bit(scen
     torch.testing.assert_close(drawn, expected, rtol=1e-4, atol=1e-2, equal_nan=True)
 
 
-def test_places_that_are_filtered_out_are_not_drawn_and_have_no_values(scene, model):
+def test_places_that_have_faded_out_are_not_drawn_and_have_no_values(scene, model):
     """As the viewer leaves out what few cameras see: of anchors and of merged Gaussians alike."""
-    camera, half = camera_at(0.0, 0.0, 6.0), scene.with_filter(lambda _, places: places[:, 0] > 0)
+    camera, half = camera_at(0.0, 0.0, 6.0), scene.with_fade(lambda _, places: (places[:, 0] > 0).float())
     kept = model.select_anchors(model.anchors.positions[:, 0] > 0)
     exact = render(half.at_error(0.0), camera).image
     assert torch.equal(exact, render(kept, camera).image)
@@ -108,6 +108,10 @@ def test_places_that_are_filtered_out_are_not_drawn_and_have_no_values(scene, mo
         assert len(x)
         assert bool((x > 0).all())
         assert int(drawn.view_splats(camera)[0].max()) < len(x)
+    half = scene.with_fade(lambda _, places: torch.full((len(places),), 0.5))
+    for error in (0.0, 2.0, 50.0):
+        whole, drawn = (each.at_error(error).view_splats(camera)[1].opacities for each in (scene, half))
+        torch.testing.assert_close(drawn, whole / 2, atol=1e-6, rtol=1e-5)
 
 
 def test_a_cut_shows_each_place_once_and_is_coarser_the_larger_the_error(scene):

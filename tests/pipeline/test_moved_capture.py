@@ -123,7 +123,7 @@ def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp
         assert ours
 
 
-def test_films_and_pictures_leave_out_what_few_cameras_see(trained, tmp_path, monkeypatch):
+def test_films_and_pictures_fade_out_where_few_cameras_see(trained, tmp_path, monkeypatch):
     frames, path = {}, RenderRequest(run=trained / "run", output=tmp_path, views="orbit", seconds=0.1, device="cpu")
 
     @contextmanager
@@ -131,7 +131,7 @@ def test_films_and_pictures_leave_out_what_few_cameras_see(trained, tmp_path, mo
         yield SimpleNamespace(write=frames.setdefault(output.stem, []).append)
 
     monkeypatch.setattr("vdgs.rendering.render_run.VideoWriter", film)
-    for number in (0, 4):
+    for number in (0, 4, None, 2):
         asked = replace(path, min_visibility=number)
         render_run(replace(asked, output=tmp_path / f"{number}.mp4"), QUIET)
         render_run(replace(asked, output=tmp_path / str(number)), QUIET)
@@ -141,6 +141,7 @@ def test_films_and_pictures_leave_out_what_few_cameras_see(trained, tmp_path, mo
     seen = get_run_visibility(opened, [view.camera for view in opened.capture.train_views])
     assert 0 < (seen >= 4).double().mean() < 1
     assert not np.array_equal(frames["0"], frames["4"])
+    assert np.array_equal(frames["None"], frames["2"])
 
 
 def test_maps_are_drawn_without_the_photographs_too(trained, folder, tmp_path):

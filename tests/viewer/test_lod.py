@@ -14,15 +14,16 @@ from vdgs.model.renderer import render
 from vdgs.viewer.lod import LodPyramid
 
 
-def test_levels_of_a_part_of_a_model_know_their_anchors():
+def test_levels_of_a_model_that_fades_out_fade_out():
     model, camera = two_floors(), camera_at(0.0, 0.0, 6.0)
-    west = model.anchors.positions[:, 0] < 0
-    levels = LodPyramid(model, west)
+    west = (model.anchors.positions[:, 0] < 0).float()
+    levels = LodPyramid(replace(model, anchors=replace(model.anchors, opacity_factors=west)))
     for most in (None, 100):
         level, _ = levels.of(camera, most)
         assert torch.equal(level.of(model.anchors.positions), level.model.anchors.positions)
-        assert (level.model.anchors.positions[:, 0] < 0).all()
-    assert len(levels.of(camera)[0].model.anchors) == int(west.sum())
+        assert torch.equal(level.model.anchors.opacity_factors, level.of(west))
+        alpha = render(level.model, camera).alpha
+        assert alpha[:, -8:].max() < 0.1 < alpha[:, :8].mean()
 
 
 @pytest.mark.parametrize("parts", [False, True])

@@ -23,6 +23,7 @@ from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
+from vdgs.runs.visibility_store import with_fade
 from vdgs.viewer import viewer_scene
 from vdgs.viewer.image_comparison import nearest_view_index, warp_image
 from vdgs.viewer.layers import LAYERS, DisplayOptions, Painter
@@ -53,7 +54,7 @@ def test_rows_drawn_one_after_another_are_the_whole_picture(scene, layer, model)
 
 def test_layers_show_what_they_say(scene):
     camera, painter = camera_at(0.0, 0.0, 6.0), Painter(scene)
-    drawn = {layer: painter.paint(DisplayOptions(layer), camera, camera) for layer in LAYERS}
+    drawn = {layer: painter.paint(DisplayOptions(layer, min_visibility=0), camera, camera) for layer in LAYERS}
     assert np.array_equal(drawn["color"], shown(scene, scene.model("merged"), camera))
     names = list(drawn)
     for a in names:
@@ -89,28 +90,32 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
         quick = painter.paint(DisplayOptions(layer), camera, camera, 200)
         assert 0 < painter.drawn_anchors <= 200
         assert np.abs(quick.astype(int) - whole).mean() < 60, layer
-    exact = Painter(seen).paint(DisplayOptions("color", full_detail=True), camera, camera)
+    exact = Painter(seen).paint(DisplayOptions("color", full_detail=True, min_visibility=0), camera, camera)
     assert np.array_equal(exact, shown(scene, model, camera))
     near = pick_position(seen.shown("merged"), camera, 32.5, 20.5)
     assert near is not None
     assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3
 
 
-def test_what_few_cameras_see_can_be_left_out(scene):
+def test_what_few_cameras_see_fades_out(scene):
     camera, painter = scene.capture.views[0].camera, Painter(scene)
-    everything = painter.paint(DisplayOptions(), camera, camera)
+    everything = painter.paint(DisplayOptions(min_visibility=0), camera, camera)
+    assert np.array_equal(everything, shown(scene, scene.model("merged"), camera))
     most = int(scene.visibility("merged").max())
     drawn = painter.paint(DisplayOptions(min_visibility=most), camera, camera)
     kept = scene.visibility("merged") >= most
     assert 0 < kept.double().mean() < 1
-    assert np.array_equal(drawn, shown(scene, scene.model("merged").select_anchors(kept), camera))
+    faded = with_fade(scene.model("merged"), scene.visibility("merged"), scene._cameras, most)
+    assert (faded.anchors.opacity_factors[kept] == 1).all()
+    assert np.array_equal(drawn, shown(scene, faded, camera))
     assert not np.array_equal(drawn, everything)
-    assert np.array_equal(painter.paint(DisplayOptions(), camera, camera), everything)
+    assert np.array_equal(painter.paint(DisplayOptions(min_visibility=99), camera, camera), drawn)  # no more see any
 
 
 def test_what_few_cameras_see_is_marked(scene):
     camera, painter, model = scene.capture.views[0].camera, Painter(scene), scene.model("merged")
-    plain, marking = painter.paint(DisplayOptions(), camera, camera), DisplayOptions(mark_trust=True)
+    marking = DisplayOptions(mark_trust=True, min_visibility=0)
+    plain = painter.paint(replace(marking, mark_trust=False), camera, camera)
     counted = scene.visibility("merged")
     for fewer in (8, 0):  # as if as many fewer had flown; at last as it was
         scene._visibility["merged"] = (counted - fewer).clamp(min=0)
@@ -124,7 +129,7 @@ def test_what_few_cameras_see_is_marked(scene):
     assert len(np.unique(reddened, axis=0)) == 3
     blocks = replace(marking, layer="blocks")
     assert np.array_equal(
-        painter.paint(blocks, camera, camera), painter.paint(DisplayOptions("blocks"), camera, camera)
+        painter.paint(blocks, camera, camera), painter.paint(DisplayOptions("blocks", min_visibility=0), camera, camera)
     )
 
 

@@ -18,6 +18,7 @@ from vdgs.training.schedule import view_sampling_weights
 from vdgs.visibility.visibility_counts import (
     count_visibility,
     effective_sample_size,
+    fade_factors,
     normalize_visibility,
     visibility_ratio,
     visibility_sampling_weights,
@@ -40,6 +41,23 @@ def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Ca
 def cloud(n: int, seed: int = 1) -> np.ndarray:
     """Points on the ground and far above the cameras, float32 values in float64."""
     return np.random.default_rng(seed).uniform([-5, -5, -2], [25, 25, 14], (n, 3)).astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("least", [1, 2, 4])
+def test_a_scene_fades_out_smoothly_beyond_what_enough_cameras_see(least: int) -> None:
+    """Along a line outwards from a picture's edge, whose cameras all end there."""
+    camera = Camera(camera_from_world=look_down(np.array([0, 0, 8.0]), 0, 0), fx=600.0, fy=600.0, cx=320, cy=240, width=640,
+                    height=480)  # fmt: skip
+    cameras, edge = [camera] * 4, 32 / 60 * 8
+    x = torch.linspace(0.5, 1.5, 400) * edge
+    places = torch.stack([x, torch.zeros(400), torch.zeros(400)], dim=1)
+    seen = count_visibility(places, cameras)
+    factors = fade_factors(places, seen, cameras, least)
+    assert (factors[seen >= least] == 1).all()
+    assert (factors[x > 1.31 * edge] == 0).all()  # 0.15 of the longer side, twice the half side
+    assert (factors.diff() <= 0).all()
+    assert factors.unique().numel() == 9
+    assert (fade_factors(places, seen, cameras, 5) == 0).all()
 
 
 @pytest.mark.parametrize("model", ["pinhole", "orthographic"])

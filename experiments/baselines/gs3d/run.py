@@ -72,18 +72,23 @@ def run_gs3d(
     visibility_map: VisibilityMap | None = None,
     lpips_weights: Path | None = None,
     device: str = "cpu",
+    method: str = METHOD_NAME,
+    adapt: Callable[[Gs3dProblem], Gs3dProblem] | None = None,
 ) -> dict[str, Any]:
-    """Train (or continue) in RUN/gaussians and measure into RUN/evaluation. Returns what metrics.json holds.
+    """Train (or continue) in RUN/gaussians and measure into RUN/evaluation. Returns what metrics.json holds. `method`
+    is the name of a method that adds to 3DGS what `adapt` does.
 
     Raises what `train_gs3d` and `evaluate_gs3d` raise.
     """
     folder = gaussians_folder(run)
     with run.locked():
-        model = train_gs3d(capture, config, folder.path, console, options=options, device=device)
+        model = train_gs3d(
+            capture, config, folder.path, console, options=options, device=device, method=method, adapt=adapt
+        )
         write_json(run.capture_file, capture_metadata(capture))
     return evaluate_gs3d(
         model.to(device), capture, run.evaluation, console,
-        visibility_map=visibility_map, lpips_weights=lpips_weights, trained=folder,
+        visibility_map=visibility_map, lpips_weights=lpips_weights, trained=folder, method=method,
     )  # fmt: skip
 
 
@@ -95,6 +100,8 @@ def train_gs3d(
     *,
     options: CheckpointOptions | None = None,
     device: str = "cpu",
+    method: str = METHOD_NAME,
+    adapt: Callable[[Gs3dProblem], Gs3dProblem] | None = None,
 ) -> GaussianModel:
     """Train, or continue, 3DGS on the training views of a capture, on a device; if it is finished, only read the model,
     which is in main memory in any case.
@@ -107,7 +114,7 @@ def train_gs3d(
     options.check()
     _check(config)
     with folder.locked():
-        _begin(folder, capture, config)
+        _begin(folder, capture, config, method)
         if folder.is_done():
             console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
             return GaussianModel.load(folder.model)
@@ -119,6 +126,7 @@ def train_gs3d(
             if config.background == "mean":
                 background = mean_image_color(images, len(views), factors[-1])
             stage = Gs3dProblem(config, images, len(views), extent, background)
+            stage = stage if adapt is None else adapt(stage)
             start = lambda: state_from_points(capture, config)  # noqa: E731
             state = resume_or_start(folder, config.iterations, start, console, device)
             train_with_checkpoints(folder, state, stage, options, console)
@@ -182,14 +190,14 @@ def _check(config: Gs3dConfig) -> None:
         raise VdgsError("These settings of 3DGS do not work:\n  " + "\n  ".join(wrong))
 
 
-def _begin(folder: StageFolder, capture: Capture, config: Gs3dConfig) -> None:
+def _begin(folder: StageFolder, capture: Capture, config: Gs3dConfig, method: str) -> None:
     """Note settings and capture of a new run, or refuse others than those of the run that is there."""
     file = folder.path / "settings.json"
     if not file.exists():
-        write_json(file, {"method": METHOD_NAME, "settings": to_dict(config), "capture": capture_metadata(capture)})
+        write_json(file, {"method": method, "settings": to_dict(config), "capture": capture_metadata(capture)})
         return
     known = read_json(file)
-    if not isinstance(known, dict) or known.get("method") != METHOD_NAME or not isinstance(known.get("settings"), dict):
+    if not isinstance(known, dict) or known.get("method") != method or not isinstance(known.get("settings"), dict):
         raise RunError(f"{file}: is damaged or of another method. Choose another output folder.")
     check_same_capture(file, known.get("capture") or {}, capture)
     changed = diff_settings(known["settings"], to_dict(config))

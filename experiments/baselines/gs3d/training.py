@@ -107,6 +107,10 @@ class Gs3dProblem:
     image_loss: ImageLoss | None = None
     #: What else pulls at the Gaussians: gradients of all of them by the names of tensors, added to those of the loss.
     pull: Callable[[Gaussians], Mapping[str, Tensor]] | None = None
+    #: What else the loss of a view holds, by the Gaussians that it shows, its camera and the iteration (from 0).
+    surface_loss: Callable[[Gaussians, Camera, int], Tensor] | None = None
+    #: Keeps the Gaussians as they have to be, in place, after each step.
+    constrain: Callable[[Gaussians], None] | None = None
     #: Training ends after so many iterations, where it ends before its schedule does.
     last: int | None = None
 
@@ -225,12 +229,13 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     behind = state.gaussians.means.new_tensor(stage.background)
     raster, means_px = render_gaussians(Gaussians(**seen), camera, behind, degree)
     photometric, fitted = _compare(state, stage, raster.image, target, mask, view)
-    value = float(photometric.loss.detach())
+    loss = photometric.loss
+    if stage.surface_loss is not None:
+        loss = loss + stage.surface_loss(Gaussians(**seen), camera, iteration)
+    value = float(loss.detach())
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    of_means_px, *gradients = torch.autograd.grad(
-        photometric.loss, [means_px, *seen.values(), *fitted], materialize_grads=True
-    )
+    of_means_px, *gradients = torch.autograd.grad(loss, [means_px, *seen.values(), *fitted], materialize_grads=True)
     psnr = training_psnr(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_LOG_INTERVAL == 0 else None
     pulled = {} if stage.pull is None else stage.pull(state.gaussians)
     _allocate_gradients(state)
@@ -239,6 +244,8 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     _adam_step(state, rows, of_seen, pulled, rates, degree)
     if stage.image_loss is not None:
         stage.image_loss.move(state.extra, gradients[len(seen) :], iteration + 1)
+    if stage.constrain is not None:
+        stage.constrain(state.gaussians)
     state.iteration += 1
 
     report = Gs3dStepReport(value, float(photometric.l1), float(photometric.ssim), len(rows))

@@ -142,8 +142,9 @@ class RenderRequest(ModelRequest):
     """Image width; 0 takes that of the training views."""
     capture: Path | None = None
     """Where the capture lies now; needed only where the run has lost its cameras.json."""
-    min_visibility: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """Leave out what fewer training cameras see (V). 2 or 3 takes floaters from the edge of the scene; 0: all."""
+    min_visibility: Annotated[int | None, Range(0, MAX_COUNT)] = None
+    """Fade out where fewer training cameras see the scene (V): its edge, with its shreds; 0: draw all. Default: 2 in
+    pictures of camera paths, 0 in those of --views test and train and in maps."""
     mode: Literal["rgb", "depth", "visibility", "alpha"] = "rgb"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (gray where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
@@ -210,7 +211,7 @@ class ExportRequest(ModelRequest):
     bbox: Annotated[tuple[float, float, float, float] | None, MAP_COORDINATE_RANGE] = None
     """Only Gaussians with centers in X0 Y0 X1 Y1, in coordinates of --crs."""
     min_visibility: Annotated[int, Range(0, MAX_COUNT)] = 0
-    """Leave out what fewer training cameras see (V). 2 or 3 takes floaters from the edge of the scene; 0: all."""
+    """Fade out where fewer training cameras see the scene (V): its edge, with its shreds (2 or 3); 0: write all."""
     max_gaussians: Annotated[int, Range(0, MAX_COUNT)] = 0
     """Largest number of Gaussians; 0: all. Neighbors are merged, those first by which the pictures change least, and
     then moved towards the model's images."""

@@ -21,6 +21,7 @@ from vdgs.export.bake_io import (
 from vdgs.export.bake_plan import COMPARE, FIT, SURVEY, UPDATE_COLORS, BakePlan, BakeStep, drop_unused_sh_degrees
 from vdgs.export.color_refinement import BakedGaussians, color_updates, rows_of_part, view_residual
 from vdgs.export.formats.gaussian_store import flatten, open_store
+from vdgs.export.gaussian_selection import with_faded_edge
 from vdgs.export.parallel import parallel_map
 from vdgs.kernels.spherical_harmonics import num_sh_bases
 from vdgs.runs.open_run import OpenedRun, open_run
@@ -33,7 +34,7 @@ ItemWriter = Callable[[int], Callable[[Path], None]]
 def bake_shard(shard: Shard) -> None:
     """Do a shard of baking. What it comes to stays beside its status until it is used up."""
     asked = drop_unused_sh_degrees(shard.request(ExportRequest))
-    run = open_run(asked.run, asked.model, shard.device)
+    run = with_faded_edge(open_run(asked.run, asked.model, shard.device), asked)
     work = BakePlan.of(run, asked)
 
     def results(left: Sequence[int]) -> Results:

@@ -38,6 +38,7 @@ from vdgs.export.gaussian_selection import (
     rows_within_reach,
     select_gaussians,
     select_rows,
+    with_faded_edge,
 )
 from vdgs.export.local_bake import BAKING, LocalBake
 from vdgs.export.local_frame import LocalFrame
@@ -170,6 +171,7 @@ def write_files(
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
     _tidy(request.output, console)
     began = time.monotonic()
+    whole, run = run, with_faded_edge(run, request)
     with _make_baker(run, request, execution, console) as baker, ExitStack() as stack:
         pixels = baker.pixels()
         kept = select_gaussians(pixels, run, request)
@@ -197,7 +199,7 @@ def write_files(
             shown.spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)), request
         )
         files = [_write_fitting(path, frames[path], scene, rows[path], merging) for path in request.output]
-        losses = _measure_losses(run, frames, scene, request, console)
+        losses = _measure_losses(whole, frames, scene, request, console)
     if request.background is not None:
         write_background(run, request.background)
     record: ExportDocument = to_jsonable({

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,21 @@ from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, default_cr
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.decode_world import gaussian_means
 from vdgs.runs.open_run import OpenedRun
-from vdgs.runs.visibility_store import get_run_visibility, require_some_seen
+from vdgs.runs.visibility_store import get_run_visibility, require_some_seen, with_fade
 
 #: A file goes without Gaussians beyond its reach where they make at most this part of what the training cameras see.
 MAX_DROPPED_SHARE = 1e-3
+
+
+def with_faded_edge(run: OpenedRun, request: ExportRequest) -> OpenedRun:
+    """The run with its model faded out where few training cameras see it, if that is asked for. Raises VdgsError where
+    nothing would be left."""
+    if not request.min_visibility:
+        return run
+    cameras = [view.camera for view in run.capture.train_views]
+    visibility = get_run_visibility(run, cameras)
+    require_some_seen(visibility, request.min_visibility)
+    return replace(run, model=with_fade(run.model, visibility, cameras, request.min_visibility))
 
 
 def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: ExportRequest) -> Int[np.ndarray, " m"]:
@@ -30,11 +42,6 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
     wanted = pixels > 0
     if request.block is not None:
         wanted &= np.repeat(_anchors_of_block(run, request.block), k)
-    if request.min_visibility:
-        visibility = get_run_visibility(run, [view.camera for view in run.capture.train_views]).cpu().numpy()
-        seen = visibility >= request.min_visibility
-        require_some_seen(bool(seen.any()), request.min_visibility, int(visibility.max(initial=0)))
-        wanted &= np.repeat(seen, k)
     if request.bbox is not None:
         x0, y0, x1, y1 = request.bbox
         if not (x0 < x1 and y0 < y1):

@@ -25,14 +25,18 @@ class Anchors:
     log_scales: Float[Tensor, "n 6"]
     #: The largest pixel, in units of the ground frame, in which each anchor is drawn (`model.levels`); None: in any.
     max_pixels: Float[Tensor, " n"] | None = None
+    #: What opacities are multiplied with where a scene fades out at its edge (`visibility_fade`); None: nothing. In
+    #: memory only: no model has it in its file.
+    opacity_factors: Float[Tensor, " n"] | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]
 
     def tensors(self) -> dict[str, Tensor]:
-        names = ("positions", *TRAINED_TENSORS)
-        levels = {} if self.max_pixels is None else {"max_pixels": self.max_pixels}
-        return {name: getattr(self, name) for name in names} | levels
+        optional = {name: getattr(self, name) for name in ("max_pixels", "opacity_factors")}
+        return {name: getattr(self, name) for name in ("positions", *TRAINED_TENSORS)} | {
+            name: tensor for name, tensor in optional.items() if tensor is not None
+        }
 
     def with_all_levels(self) -> Anchors:
         """The anchors of which every view draws all levels; themselves where they have none."""

@@ -45,8 +45,11 @@ def decode_world(
     direction = torch.as_tensor(camera.forward).to(ray).expand_as(ray) if level else ray / distance
     inputs = torch.cat([anchors.features[rows], direction, distance], 1)
     covariance = weights.covariance.forward(inputs).unflatten(1, (k, 7))
+    opacities = weights.opacity.forward(inputs).tanh()
+    if anchors.opacity_factors is not None:
+        opacities = opacities * anchors.opacity_factors[rows, None]
     return DecodedGaussians(
-        weights.opacity.forward(inputs).tanh(),
+        opacities,
         weights.color.forward(inputs).unflatten(1, (k, 3)).sigmoid(),
         anchors.log_scales[rows, None, 3:].exp() * covariance[..., :3].sigmoid(),
         covariance[..., 3:],

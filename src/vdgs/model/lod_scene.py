@@ -37,8 +37,8 @@ class LodScene:
     view: Camera | None = None
     #: Of the photographs, where anchors are drawn without aliasing (`Antialiased`): merged Gaussians always are.
     pixel: float | None = None
-    #: Which places are drawn, asked for as by `values`; None: all.
-    is_drawn: Callable[[NodeContent, Tensor], Tensor] | None = None
+    #: What opacities are multiplied with, asked for as by `values`; None: nothing.
+    fade: Callable[[NodeContent, Tensor], Tensor] | None = None
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
     _gaussians: dict[tuple[int, ...], Gaussians | None] = field(default_factory=dict)
 
@@ -70,9 +70,9 @@ class LodScene:
         """The same scene, its anchors drawn as `renderer.Antialiased` draws them."""
         return replace(self, pixel=pixel)
 
-    def with_filter(self, is_drawn: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
-        """The same scene without the places for which this is False."""
-        return replace(self, is_drawn=is_drawn, _anchors={}, _gaussians={})
+    def with_fade(self, factors: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
+        """The same scene, opacities multiplied with these; places of 0 are left out."""
+        return replace(self, fade=factors, _anchors={}, _gaussians={})
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -109,7 +109,7 @@ class LodScene:
         cut, found = self._cut(camera), list[Tensor]()
         for nodes, each in ((cut.leaves, self._leaf_values), (cut.nodes, self._node_values)):
             if nodes:
-                values, drawn = each(nodes, of), None if self.is_drawn is None else each(nodes, self.is_drawn).bool()
+                values, drawn = each(nodes, of), None if self.fade is None else each(nodes, self.fade) > 0
                 found.append(values if drawn is None else values[drawn])
         return torch.cat(found) if found else torch.zeros(0)
 
@@ -140,16 +140,23 @@ class LodScene:
         if found is None:
             return None
         anchors, rows = found
-        if self.is_drawn is not None:
-            drawn = self._leaf_values(leaves, self.is_drawn).bool()
-            anchors, rows = anchors.select(drawn), rows[drawn]
+        if self.fade is not None:
+            factors = self._leaf_values(leaves, self.fade)
+            drawn = factors > 0
+            anchors = replace(anchors.select(drawn), opacity_factors=factors[drawn].to(anchors.positions))
+            rows = rows[drawn]
         return model_of_rows(self.model, anchors, rows).to(self.device)
 
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> Gaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
         found = self.tree.gaussians_of(nodes)
-        if found is not None and self.is_drawn is not None:
-            found = found.select(self._node_values(nodes, self.is_drawn).bool())
+        if found is not None and self.fade is not None:
+            factors = self._node_values(nodes, self.fade)
+            drawn = factors > 0
+            found = found.select(drawn)
+            opacities = found.opacity_logits.sigmoid() * factors[drawn].to(found.opacity_logits)
+            whole = factors[drawn] == 1
+            found = replace(found, opacity_logits=torch.where(whole, found.opacity_logits, opacities.logit()))
         if found is None:
             return None
         return Gaussians(**{name: tensor.to(self.device) for name, tensor in found.tensors().items()})

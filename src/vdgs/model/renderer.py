@@ -132,11 +132,14 @@ def decode_view(
         (first, decode_anchors(model.anchors, rows[first:last], decoder.weights_for_image(image_index), camera))
         for first, last, decoder in shown
     ]
-    if len(parts) == 1:
-        return rows, parts[0][1]
-    k, names = model.anchors.offsets.shape[1], (*SPLAT_TENSORS, "volumes")
-    named = {name: torch.cat([getattr(splats, name) for _, splats in parts]) for name in names}
-    return rows, AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in parts]))
+    k, splats = model.anchors.offsets.shape[1], parts[0][1]
+    if len(parts) > 1:
+        named = {name: torch.cat([getattr(each, name) for _, each in parts]) for name in (*SPLAT_TENSORS, "volumes")}
+        splats = AnchorSplats(**named, source=torch.cat([each.source + first * k for first, each in parts]))
+    if model.anchors.opacity_factors is not None:
+        factors = model.anchors.opacity_factors[rows][splats.source.long() // k]
+        splats = replace(splats, opacities=splats.opacities * factors)
+    return rows, splats
 
 
 def rasterize_splats(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:

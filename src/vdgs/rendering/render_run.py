@@ -19,6 +19,7 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation.comparison_images import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.renderer import Drawable, render, without_aliasing
 from vdgs.rendering import camera_paths
@@ -30,13 +31,13 @@ from vdgs.runs.lod_folder import open_lod
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.visibility_store import get_run_visibility, require_some_seen, without_rarely_seen
+from vdgs.runs.visibility_store import get_run_visibility, require_some_seen, with_fade
 from vdgs.system.atomic_files import write_array
 from vdgs.system.console import track
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
-from vdgs.visibility.visibility_counts import count_visibility
+from vdgs.visibility.visibility_counts import FADE_BELOW, count_visibility, fade_factors
 
 #: Frames a second of a video of separate views.
 STILLS_FPS = 2.0
@@ -88,8 +89,8 @@ def render_run(request: RenderRequest, console: Console) -> None:
     run, scene = _open(request)
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
-    if request.min_visibility:
-        run, scene = _without_rarely_seen(run, scene, run_cameras.cameras, request.min_visibility)
+    scene = _with_fade(request, run, scene, run_cameras.cameras)
+    run = replace(run, model=scene) if isinstance(scene, AnchorModel) else run
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
     named, fps = _named_cameras(request, run_cameras)
@@ -111,17 +112,28 @@ def _open(request: RenderRequest) -> tuple[OpenedModel, Drawable]:
     return run, tree.at_error(request.lod_error)
 
 
-def _without_rarely_seen(
-    run: OpenedModel, scene: Drawable, cameras: Sequence[Camera], min_visibility: int
-) -> tuple[OpenedModel, Drawable]:
-    """The model and what it is drawn from, without what fewer of the training cameras see. Raises VdgsError where
-    nothing is left."""
-    if not isinstance(scene, LodScene):
-        model = without_rarely_seen(run.model, get_run_visibility(run, cameras), min_visibility)
-        return replace(run, model=model), model
-    root = count_visibility(scene.tree.gaussians(0).means, cameras)
-    require_some_seen(bool((root >= min_visibility).any()), min_visibility, int(root.max()))
-    return run, scene.with_filter(lambda _, places: count_visibility(places, cameras) >= min_visibility)
+def _with_fade(request: RenderRequest, run: OpenedModel, scene: Drawable, cameras: Sequence[Camera]) -> Drawable:
+    """What is drawn, faded out where fewer of the training cameras see it than was asked for. Raises VdgsError where
+    nothing would be left; the default leaves scenes alone that so few see."""
+    photographs = request.path is None and request.views in ("test", "train")
+    least = request.min_visibility
+    if least is None:
+        least = 0 if photographs or request.mode != "rgb" else FADE_BELOW
+    if not least:
+        return scene
+    in_levels = isinstance(scene, LodScene)
+    visibility = (
+        count_visibility(scene.tree.gaussians(0).means, cameras) if in_levels else get_run_visibility(run, cameras)
+    )
+    if request.min_visibility is not None:
+        require_some_seen(visibility, least)
+    elif not bool((visibility >= least).any()):
+        return scene
+    if isinstance(scene, LodScene):
+        return scene.with_fade(
+            lambda _, places: fade_factors(places, count_visibility(places, cameras), cameras, least)
+        )
+    return with_fade(run.model, visibility, cameras, least)
 
 
 def _check(request: RenderRequest) -> None:

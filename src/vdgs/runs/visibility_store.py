@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
-from jaxtyping import Int32
+from jaxtyping import Int32, Real
 from torch import Tensor
 
 from vdgs.errors import VdgsError
@@ -16,7 +17,7 @@ from vdgs.runs.open_run import OpenedModel, OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import read_tensors, tensors_crc32, write_tensors
-from vdgs.visibility.visibility_counts import count_visibility
+from vdgs.visibility.visibility_counts import count_visibility, fade_factors
 
 VISIBILITY_FORMAT = "vdgs-visibility-1"
 VISIBILITY_FILE = "visibility.safetensors"
@@ -34,19 +35,18 @@ def get_run_visibility(opened: OpenedModel, cameras: Sequence[Camera]) -> Int32[
     return saved.to(opened.device)
 
 
-def without_rarely_seen(model: AnchorModel, visibility: Tensor, min_visibility: int) -> AnchorModel:
-    """A model without the anchors that fewer than `min_visibility` training cameras see: nothing fixes their depth.
+def with_fade(
+    model: AnchorModel, visibility: Real[Tensor, " n"], cameras: Sequence[Camera], min_visibility: int
+) -> AnchorModel:
+    """A model that fades out where fewer than `min_visibility` training cameras see it: nothing fixes depths there. It
+    shares the tensors of the other one."""
+    factors = fade_factors(model.anchors.positions, visibility, cameras, min_visibility)
+    return replace(model, anchors=replace(model.anchors, opacity_factors=factors))
 
-    Raises VdgsError where that leaves nothing.
-    """
-    kept = visibility.to(model.anchors.positions.device) >= min_visibility
-    require_some_seen(bool(kept.any()), min_visibility, int(visibility.max()) if len(visibility) else 0)
-    return model.select_anchors(kept)
 
-
-def require_some_seen(is_any: bool, min_visibility: int, most: int) -> None:
-    """Raise VdgsError where no anchor is seen by enough cameras."""
-    if not is_any:
+def require_some_seen(visibility: Real[Tensor, " n"], min_visibility: int) -> None:
+    """Raise VdgsError where no place is seen by enough cameras."""
+    if (most := int(visibility.max()) if len(visibility) else 0) < min_visibility:
         raise VdgsError(f"--min-visibility {min_visibility}: leaves nothing; give at most {most}.")
 
 

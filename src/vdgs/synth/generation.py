@@ -64,7 +64,8 @@ _OFF_PATH_NOTE = """\
   half of them for validation, with poses and truth. vdgs never trains on them; `vdgs eval` measures them by themselves.
 """
 _MOVING_NOTE = """\
-- `truth/masks/`: what moves between training photographs, and its shadow, in black. Others show none of it.
+- `truth/masks/`: what moves between training photographs, its shadow, and moving water, in black. Others show none of
+  it.
 """
 _TRUTH_NOTE = """- `truth/`: depth and true visibility (with occlusion) per pixel, true poses, true places of points.
   Read it with `vdgs.captures.ground_truth.load_ground_truth`; the module says what is where.
@@ -104,7 +105,7 @@ def generate(output: Path, options: SynthOptions, on_progress: ProgressCallback)
 def _write_capture(folder: Path, options: ResolvedOptions, on_progress: ProgressCallback) -> FlightStats:
     """Write a complete capture into an empty folder."""
     on_progress("town", 0, 1)
-    town = build_town(options.seed, options.extent_m)
+    town = build_town(options.seed, options.extent_m, options.moving_water)
     tracer = RayTracer(town.mesh)
     on_progress("town", 1, 1)
     with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
@@ -135,7 +136,7 @@ def _write_capture(folder: Path, options: ResolvedOptions, on_progress: Progress
         validation=options.num_validation_images,
         poses="noisy" if options.pose_noise_px else "true", points=len(cloud.points), noise_px=options.noise_px,
         off_path=_OFF_PATH_NOTE if views.off_path else "", truth=_TRUTH_NOTE if options.truth else "",
-        imbalance=stats.summary, moving=_MOVING_NOTE if options.num_moving_objects else "",
+        imbalance=stats.summary, moving=_MOVING_NOTE if options.has_motion else "",
         options="\n".join(f"- {line}" for line in options.to_lines),
     )  # fmt: skip
     (folder / "capture.md").write_text(note, encoding="utf-8")
@@ -173,14 +174,14 @@ def _render_images(
 
     moving = make_moving_objects(town, options.num_moving_objects, options.seed)
     masks = folder.parent / "truth" / "masks"
-    if moving:
+    if options.has_motion:
         masks.mkdir(parents=True)
 
     def render(k: int) -> SeedPoints | None:
         camera = views.cameras[k]
         image = shown = render_image(town, tracer, sky, camera, options.samples_per_pixel, views.gains[k])
-        if moving and k < views.training:
-            then = place_moving_objects(town, tracer, moving, options.seed, k)
+        if options.has_motion and k < views.training:
+            then = place_moving_objects(_with_waves(town, options, k), tracer, moving, options.seed, k)
             shown = render_image(*then, sky, camera, options.samples_per_pixel, views.gains[k])
             Image.fromarray(still_mask(image, shown)).save(masks / f"{Path(views.names[k]).stem}.png")
         Image.fromarray(shown).save(folder / views.names[k], quality=95, subsampling=0)
@@ -194,6 +195,14 @@ def _render_images(
         seeds.append(points)
         on_progress("images", done, total)
     return [points for points in seeds if points is not None]
+
+
+def _with_waves(town: Town, options: ResolvedOptions, photograph: int) -> Town:
+    """The town with the waves of one photograph, where its water moves."""
+    if not options.moving_water:
+        return town
+    x, y = np.random.default_rng([options.seed, 15, photograph]).uniform(0, 1000, 2).tolist()
+    return replace(town, waves=(x, y))
 
 
 def _write_off_path(

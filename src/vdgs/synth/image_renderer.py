@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from vdgs.synth.lighting import (
 )
 from vdgs.synth.mesh import Material
 from vdgs.synth.ray_tracing import RayHits, RayTracer
-from vdgs.synth.surface import Surface
+from vdgs.synth.surface import Surface, smooth
 from vdgs.synth.town import Town
 
 #: The shader of each material but the ground is the function of its name in `facades`.
@@ -34,6 +35,9 @@ _SHADERS: dict[Material, Callable[[Surface], AlbedoAndGloss]] = {
 _CHUNK = 1 << 16
 #: How far samples spread beyond their pixel: a little softness against aliasing.
 _SAMPLE_SPREAD = 1.15
+#: Root mean square slope of waves along an axis in a wind of about 7 m/s (Cox and Munk, 1954), and the lengths (m) of
+#: the waves with the share of its square that each has (choice).
+_WAVE_SLOPE, _WAVE_LENGTHS, _WAVE_SHARES = np.float32(0.14), (3.0, 1.2, 0.5), (0.25, 0.35, 0.4)
 
 
 def surface_at(
@@ -105,6 +109,8 @@ def radiance(
         return light, hits
     found = RayHits(hits.triangle[met], hits.distance[met], hits.u[met], hits.v[met])
     surface, material, flat = surface_at(town, found, origins[met], directions[met], pixel_angle)
+    if town.waves is not None:
+        surface = replace(surface, normal=_normals_on_waves(surface, material, town.waves))
     albedo, gloss = _albedo(town, surface, material)
     facing = np.clip(surface.normal @ SUN, 0, 1)
     lit = np.flatnonzero((facing > 0) & (flat @ SUN > 0))
@@ -120,6 +126,17 @@ def radiance(
     if sky.is_cloudy:
         light[met] = add_haze(light[met], found.distance)
     return light, hits
+
+
+def _normals_on_waves(surface: Surface, material: np.ndarray, start: tuple[float, float]) -> np.ndarray:
+    """The normals [n, 3], those of water turned by the slopes of waves."""
+    at, normals = np.flatnonzero(material == Material.WATER), surface.normal.copy()
+    x, y = (surface.position[at, k] + np.float32(start[k]) for k in range(2))
+    for length, share in zip(_WAVE_LENGTHS, _WAVE_SHARES, strict=True):
+        for k, (u, v) in enumerate(((x, y), (y + 511, x))):
+            normals[at, k] -= _WAVE_SLOPE * np.float32(share**0.5) * smooth(u, v, length, surface.footprint[at])
+    normals[at] /= np.linalg.norm(normals[at], axis=1, keepdims=True)
+    return normals
 
 
 def _reflection(surface: Surface, gloss: np.ndarray, sun: np.ndarray) -> np.ndarray:

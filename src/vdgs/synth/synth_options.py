@@ -45,6 +45,9 @@ class SynthOptions:
     num_moving_objects: Annotated[int, Range(0, 100_000)] = 0
     """How many cars, buses and people move about the streets of the whole place: each training photograph shows them
     elsewhere (what moves is black in truth/masks). Test, validation and off-path photographs show none."""
+    moving_water: bool = False
+    """The pond lies in the middle of the town, and each training photograph meets other waves, which mirror sky and sun
+    elsewhere (what differs from still water is black in truth/masks). Other photographs show still water."""
     width: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
     """Width of an image in pixels."""
     height: Annotated[int | None, Range(16, MAX_RENDER_SIDE_PX)] = None
@@ -112,7 +115,12 @@ class ResolvedOptions(SynthOptions):
     extent_m: float
 
     @property
+    def has_motion(self) -> bool:
+        """Whether anything differs between training photographs of one place."""
+        return self.moving_water or self.num_moving_objects > 0
+
+    @property
     def to_lines(self) -> list[str]:
         """One `name: value` a line, for people; without what does not change the result."""
-        unused = {"size", "workers"} | (set() if self.num_moving_objects else {"num_moving_objects"})
+        unused = {"size", "workers"} | {name for name in ("num_moving_objects", "moving_water") if not vars(self)[name]}
         return [f"{name}: {value}" for name, value in vars(self).items() if name not in unused]

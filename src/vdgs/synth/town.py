@@ -36,10 +36,13 @@ class Town:
     #: Places [k, 2] (m) worth flying around, the square first; and a height (m) that no building exceeds.
     landmarks: np.ndarray
     tallest: float
+    #: Where the pattern of the waves begins (m); None: the water is still.
+    waves: tuple[float, float] | None = None
 
 
-def build_town(seed: int, extent_m: float) -> Town:
-    """A town of about `extent` metres a side around the origin; the same arguments give the same town."""
+def build_town(seed: int, extent_m: float, pond_within: bool = False) -> Town:
+    """A town of about `extent` metres a side around the origin, its pond behind an edge or in a block within; the same
+    arguments give the same town."""
     rng = np.random.default_rng([seed, 1])
     plan = make_street_plan(rng, extent_m)
     land = Terrain(extent_m / 2, tuple(float(v) for v in rng.uniform(0, 6, 4)))
@@ -48,10 +51,11 @@ def build_town(seed: int, extent_m: float) -> Town:
     plots = edge_plots(site)
     pond_plot = int(rng.integers(len(plots)))
     grand = len(plan.p) > _GRAND
-    ponds = [_pond(site, plots[pond_plot])] + ([_lake(site, plots, pond_plot, extent_m)] if grand else [])
+    pond = _pond_of_block(site, site.block(*_pond_cell(plan))) if pond_within else _pond(site, plots[pond_plot])
+    ponds = [pond] + ([_lake(site, plots, pond_plot, extent_m)] if grand else [])
     site = replace(site, terrain=replace(land, ponds=tuple(ponds)))
-    landmarks = _blocks(site, grand)
-    build_outskirts(site, pond_plot)
+    landmarks = _blocks(site, grand, pond_within)
+    build_outskirts(site, -1 if pond_within else pond_plot)
     _traffic(site)
     scatter_trees(site, extent_m / 2 + 20, count=int(60 + extent_m / 2))
     build_periphery(replace(site, rng=np.random.default_rng([seed, 11])), extent_m / 2)
@@ -66,6 +70,17 @@ def build_town(seed: int, extent_m: float) -> Town:
 def _pond(site: Site, plot: Plot) -> Pond:
     """The pond behind an edge of the town, level with the lowest ground of its shore."""
     return _water(site, plot, 14.0, (15.0, 13.0), 32)
+
+
+def _pond_cell(plan: StreetPlan) -> tuple[int, int]:
+    """The block beside the square that has the pond of a town with one within."""
+    return plan.p_main - 1, plan.q_main + (1 if plan.q_main + 2 < len(plan.q) else -1)
+
+
+def _pond_of_block(site: Site, block: Plot) -> Pond:
+    """A round pond that leaves its banks (`Terrain.height`) within the block."""
+    radius = (min(block.width, block.depth) / 2 - 3.5) / 1.14
+    return _water(site, block, 0.0, (radius, radius), 32)
 
 
 def _water(site: Site, plot: Plot, b: float, radii: tuple[float, float], samples: int, shore_ry: float = 0.0) -> Pond:
@@ -105,7 +120,7 @@ def _landmarks(site: Site, blocks: list[tuple[int, int]]) -> np.ndarray:
     return np.stack(site.plan.to_world(*middles.T), 1)
 
 
-def _blocks(site: Site, grand: bool) -> np.ndarray:
+def _blocks(site: Site, grand: bool, pond_within: bool) -> np.ndarray:
     """The square in the middle, shops around it, houses further out, a park and works among them, and in a grand town
     towers and further squares; returns the landmarks [k, 2]."""
     rows, columns = len(site.plan.q) - 1, len(site.plan.p) - 1
@@ -115,6 +130,9 @@ def _blocks(site: Site, grand: bool) -> np.ndarray:
     site.rng.shuffle(cells)
     cells.sort(key=lambda cell: away[cell])
     town_center.square(site, site.block(i0, j0))
+    if pond_within:
+        cells.remove(_pond_cell(site.plan))
+        town_center.pond_park(site, site.block(*_pond_cell(site.plan)))
     high = _tower_blocks(cells, (i0, j0)) if grand else []
     for cell in high:
         towers(site, site.block(*cell))

@@ -97,6 +97,16 @@ def park(site: Site, block: Plot) -> None:
             hedge(site.builder, site.frame(block, a, b), 0.7 * w, 1.0)
 
 
+def pond_park(site: Site, block: Plot) -> None:
+    """A lawn about the pond of the block, with trees in its corners and benches."""
+    w, d = block.width / 2, block.depth / 2
+    site.paint_all(block, LandUse.LAWN)
+    for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        tree(site.builder, site.frame(block, a * (w - 2), b * (d - 2)), site.rng, "round", 4.5)
+    for b in (-1, 1):
+        props.bench(site.builder, site.frame(block, 0, b * (d - 1)))
+
+
 def works(site: Site, block: Plot) -> None:
     """A saw-tooth hall, a supermarket with solar panels, and their car park."""
     rng = site.rng

@@ -23,6 +23,7 @@ from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.point_panel import PointPanel
 from vdgs.viewer.render_scheduler import RenderedFrame, RenderScheduler
 from vdgs.viewer.viewer_scene import ViewerScene
+from vdgs.visibility.visibility_counts import FADE_BELOW
 
 #: Labels of the layers in the panel.
 LAYER_LABELS: dict[str, Layer] = {
@@ -203,7 +204,12 @@ class ClientSession:
         self._image_split = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
         self._image_split.on_update(lambda _: self.change_display(image_split=float(self._image_split.value)))
         trust = gui.add_slider(
-            "Seen by at least", 0, _MAX_MIN_VISIBILITY, 1, 0, hint="Leave out what fewer photographs show: the edge"
+            "Seen by at least",
+            0,
+            _MAX_MIN_VISIBILITY,
+            1,
+            FADE_BELOW,
+            hint="Fade out where fewer photographs show the scene: its edge; 0: draw all",
         )
         trust.on_update(lambda _: self.change_display(min_visibility=int(trust.value)))
         marks = gui.add_checkbox(

@@ -25,6 +25,7 @@ from vdgs.model.renderer import (
 from vdgs.viewer.image_comparison import ImageComparison, warp_image
 from vdgs.viewer.lod import LodLevel
 from vdgs.viewer.viewer_scene import ViewerScene
+from vdgs.visibility.visibility_counts import FADE_BELOW
 
 if TYPE_CHECKING:
     from vdgs.rendering.scalar_maps import ColorScale
@@ -56,8 +57,8 @@ class DisplayOptions:
     image_split: float = 0.5
     #: Draw views at rest from all anchors, also where the run has a level-of-detail tree.
     full_detail: bool = False
-    #: What fewer training cameras see is not drawn.
-    min_visibility: int = 0
+    #: The scene fades out where fewer training cameras see it.
+    min_visibility: int = FADE_BELOW
     #: In the layer `color`: mark what fewer than three training cameras see.
     mark_trust: bool = False
 

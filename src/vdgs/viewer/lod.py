@@ -39,10 +39,9 @@ class LodLevel:
 class LodPyramid:
     """A model and its thinner ones, each made when it is first needed."""
 
-    def __init__(self, model: AnchorModel, mask: Bool[Tensor, " n"] | None = None) -> None:
-        """Of the model, or of its anchors in the mask."""
-        self._model = model if mask is None else model.select_anchors(mask)
-        self._levels = [LodLevel(self._model, mask)]
+    def __init__(self, model: AnchorModel) -> None:
+        self._model = model
+        self._levels = [LodLevel(model)]
 
     def of(self, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """The model itself, or the finest level of which the camera sees at most so many anchors; and about how many
@@ -52,17 +51,8 @@ class LodPyramid:
         while max_anchors is not None and visible // decimation_factor(number) > max(max_anchors, 1):
             number += 1
         while len(self._levels) <= number:
-            self._levels.append(_within(self._levels[0], decimate(model, decimation_factor(len(self._levels)))))
+            self._levels.append(decimate(model, decimation_factor(len(self._levels))))
         return self._levels[number], visible // decimation_factor(number)
-
-
-def _within(whole: LodLevel, level: LodLevel) -> LodLevel:
-    """A level of a part of a model as one of the model."""
-    if whole.mask is None or level.mask is None:
-        return level
-    mask = torch.zeros_like(whole.mask)
-    mask[whole.mask] = level.mask
-    return replace(level, mask=mask)
 
 
 def decimation_factor(level: int) -> int:

@@ -27,9 +27,9 @@ from vdgs.model.renderer import Drawable, render
 from vdgs.partition.blocks import Blocks, xy_positions
 from vdgs.runs.lod_folder import find_tree
 from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
-from vdgs.runs.visibility_store import get_run_visibility
+from vdgs.runs.visibility_store import get_run_visibility, with_fade
 from vdgs.viewer.lod import LodLevel, LodPyramid
-from vdgs.visibility.visibility_counts import count_visibility
+from vdgs.visibility.visibility_counts import count_visibility, fade_factors
 
 ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
@@ -56,7 +56,7 @@ class ViewerScene:
         self._levels: dict[str, dict[int, LodPyramid]] = {}
         self._trees: dict[str, LodScene | None] = {}
         #: The last that was asked for.
-        self._filtered_trees: dict[tuple[str, int], LodScene] = {}
+        self._faded_trees: dict[tuple[str, int], LodScene] = {}
         self._values: dict[tuple[str, NodeContent], Tensor] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
@@ -97,10 +97,10 @@ class ViewerScene:
         self, name: str, camera: Camera, max_anchors: int | None = None, *, full_camera: Camera | None = None,
         full_detail: bool = False, min_visibility: int = 0,
     ) -> tuple[LodLevel, int]:  # fmt: skip
-        """The level of detail to draw, with at most so many anchors in view, and how many those are; without what fewer
-        than `min_visibility` training cameras see. Of a tree, merged Gaussians count as anchors by their cost. `camera`
-        may be a part of `full_camera`."""
-        tree = self._filtered(name, min_visibility)
+        """The level of detail to draw, with at most so many anchors in view, and how many those are; faded out where
+        fewer than `min_visibility` training cameras see. Of a tree, merged Gaussians count as anchors by their cost.
+        `camera` may be a part of `full_camera`."""
+        tree = self._faded_tree(name, min_visibility)
         if tree is None:
             return self._pyramid(name, min_visibility).of(camera, max_anchors)
         if full_detail and max_anchors is None:
@@ -112,27 +112,41 @@ class ViewerScene:
             tree = tree.at_error(least).within(view, cost).for_view(view)
         return LodLevel(tree), max(1, tree.cost(camera) // ANCHOR_COST)
 
-    def _filtered(self, name: str, min_visibility: int) -> LodScene | None:
-        """The tree of a model without what fewer than so many training cameras see; None where it has none."""
+    def _faded_tree(self, name: str, min_visibility: int) -> LodScene | None:
+        """The tree of a model that fades out where fewer than so many training cameras see; None where it has none."""
         tree = self.tree(name)
         if tree is None or not min_visibility:
             return tree
-        if (name, min_visibility) not in self._filtered_trees:
-            seen = partial(self._node_values, f"{name} V", self._count_visibility)
-            self._filtered_trees.clear()
-            self._filtered_trees[name, min_visibility] = tree.with_filter(
-                lambda content, places: seen(content, places) >= min_visibility
+        if (name, min_visibility) not in self._faded_trees:
+            least = min(min_visibility, int(self.visibility_sample(name).max()))
+            self._faded_trees.clear()
+            self._faded_trees[name, min_visibility] = tree.with_fade(
+                partial(self._node_values, f"{name} fade {least}", partial(self._count_fade, least))
             )
-        return self._filtered_trees[name, min_visibility]
+        return self._faded_trees[name, min_visibility]
+
+    def _count_fade(self, min_visibility: int, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        return fade_factors(places, self._count_visibility(places), self._cameras, min_visibility)
 
     def _pyramid(self, name: str, min_visibility: int) -> LodPyramid:
         """The levels of a model without a tree."""
         pyramids = self._levels.setdefault(name, {})
         if min_visibility not in pyramids:
             whole = {0: pyramids[0]} if 0 in pyramids else {}
-            mask = self.visibility(name) >= min_visibility if min_visibility else None
-            pyramids = self._levels[name] = whole | {min_visibility: LodPyramid(self.model(name), mask)}
+            pyramids = self._levels[name] = whole | {min_visibility: LodPyramid(self._faded(name, min_visibility))}
         return pyramids[min_visibility]
+
+    def _faded(self, name: str, min_visibility: int) -> AnchorModel:
+        """A model that fades out where fewer than so many training cameras see, or fewer than see any of it."""
+        model = self.model(name)
+        if not min_visibility or not len(model.anchors):
+            return model
+        visibility = self.visibility(name)
+        return with_fade(model, visibility, self._cameras, min(min_visibility, int(visibility.max())))
+
+    @property
+    def _cameras(self) -> list[Camera]:
+        return [view.camera for view in self.capture.train_views]
 
     def level_visibility(self, name: str, level: LodLevel, camera: Camera) -> Tensor:
         """V of what a level draws in a view."""
@@ -160,22 +174,21 @@ class ViewerScene:
         return self._values[what, content]
 
     def _count_visibility(self, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-        return count_visibility(places, [view.camera for view in self.capture.train_views]).float()
+        return count_visibility(places, self._cameras).float()
 
     def replace_run(self, run: OpenedRun) -> None:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
         self._visibility, self._block_tints, self._levels, self._exposures = {}, {}, {}, {}
-        self._trees, self._filtered_trees, self._values = {}, {}, {}
+        self._trees, self._faded_trees, self._values = {}, {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
     def visibility(self, name: str) -> Float[Tensor, " n"]:
         """V of every anchor of a model."""
         if name not in self._visibility:
-            cameras = [view.camera for view in self.capture.train_views]
-            self._visibility[name] = get_run_visibility(self.get_run(name), cameras).float()
+            self._visibility[name] = get_run_visibility(self.get_run(name), self._cameras).float()
         return self._visibility[name]
 
     def exposures(self, name: str) -> ViewExposures | None:

@@ -8,10 +8,11 @@ the cameras of a growth cycle).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int, Int32
+import torch
+from jaxtyping import Float, Int, Int32, Real
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
@@ -22,6 +23,11 @@ PERCENTILES = (5, 25, 50, 75, 95)
 LOW_VISIBILITY_LIMITS = (3, 5, 10)
 #: Keeps V̂ finite where all anchors are seen alike (eq. 5).
 EPSILON = 1e-8
+#: In the viewer and in films a scene fades out where fewer cameras see it (choice): two are needed to fix a depth.
+FADE_BELOW = 2
+#: It has faded out where it lies so far beyond a picture's edge, as a share of the longer side, and V is counted at so
+#: many places in between (choice).
+FADE_MARGIN, FADE_STEPS = 0.15, 8
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,30 @@ def count_visibility(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera])
     Raises TypeError or ValueError unless positions are float32 or float64 [n, 3].
     """
     return get_backend(positions.device).count_visibility(positions, cameras)
+
+
+def fade_factors(
+    positions: Float[Tensor, "n 3"], visibility: Real[Tensor, " n"], cameras: Sequence[Camera], min_visibility: int
+) -> Float[Tensor, " n"]:
+    """What opacities are multiplied with where a scene fades out at its edge, by V of each place: 1 where at least
+    `min_visibility` cameras hold it; farther out it falls smoothly to 0, by how much larger pictures would have to be
+    for so many to hold it."""
+    factors, rare = torch.ones_like(positions[:, 0]), visibility < min_visibility
+    if bool(rare.any()):
+        margins = [FADE_MARGIN * (step + 0.5) / FADE_STEPS for step in range(FADE_STEPS)]
+        counts = [count_visibility(positions[rare], [_widened(each, margin) for each in cameras]) for margin in margins]
+        held = (torch.stack(counts) >= min_visibility).float().mean(dim=0)
+        factors[rare] = (held * held * (3 - 2 * held)).to(factors)
+    return factors
+
+
+def _widened(camera: Camera, margin: float) -> Camera:
+    """A camera whose picture shows more on each side, by a share of its longer side."""
+    more = max(1, round(margin * max(camera.width, camera.height)))
+    return replace(
+        camera, width=camera.width + 2 * more, height=camera.height + 2 * more, cx=camera.cx + more,
+        cy=camera.cy + more, uncropped_size=None,
+    )  # fmt: skip
 
 
 def visibility_sampling_weights(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:

@@ -11,6 +11,7 @@ import base64
 import html
 import json
 import re
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -73,6 +74,8 @@ _PORTRAIT = (
     "if(said!==null||name!=='initialCameraPosition'||!(times>1))return said;"
     "return from.map((x,i)=>to[i]+times*(x-to[i])).join(',');}}}</script>"
 )
+#: The box that marks where trust ends.
+_TRUST_BOX = Path(__file__).with_name("trust_box.html")
 _CAPTION = (
     "position:fixed;left:0;bottom:0;z-index:2;margin:0;padding:.35em .7em;font:13px/1.4 system-ui,sans-serif;"
     "color:#222;background:rgba(255,255,255,.75);pointer-events:none"
@@ -196,11 +199,23 @@ def _document(gaussians: Gaussians, factor: float, page: InitialView, scene: Exp
         f'<p style="{_CAPTION}">{title} · {len(gaussians):,} Gaussians, the same colors from all sides · '
         "drag to turn, right button or two fingers to move, wheel or pinch to zoom</p>"
     )
+    caption += _trust_box(gaussians, page)
     client = _client_html().replace("<title>Viser</title>", f"<title>{title}</title>", 1)
     client = client.replace('<meta charset="utf-8" />', f'<meta charset="utf-8" />{head}', 1)
     client = client.replace("</head>", f"{script}</head>", 1)
     before, after = client.rsplit("</body>", 1)
     return f"{before}{caption}</body>{after}".encode()
+
+
+def _trust_box(gaussians: Gaussians, page: InitialView) -> str:
+    """What lets a visitor mark where trust ends; nothing where V is not known. Two bits for each Gaussian: V of 0 or 1,
+    of 2, or more (the number that is free in the client's rows is overwritten by the client)."""
+    if page.count_visibility is None:
+        return ""
+    few = (page.count_visibility(gaussians.means).clamp(1, 3) - 1).to(torch.uint8).numpy()
+    fours = np.concatenate([few, np.zeros(-len(few) % 4, np.uint8)]).reshape(-1, 4)
+    packed = base64.b64encode(zlib.compress((fours << np.arange(0, 8, 2, dtype=np.uint8)).sum(1, dtype=np.uint8), 9))
+    return _TRUST_BOX.read_text().replace("$SEEN", packed.decode("ascii")).replace("$COUNT", str(len(few)))
 
 
 def _client_html() -> str:
