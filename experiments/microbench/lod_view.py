@@ -1,5 +1,5 @@
 """How a scene with a level-of-detail tree is looked at: the time to the first picture, pictures a second in motion, the
-time to the picture at rest and what it lacks against full detail, memory.
+time to the picture at rest and what it lacks against full detail, how it then comes nearer to that, memory.
 
     OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.lod_view RUN [--width 640] [--height 480] [--seconds 4]
 
@@ -14,7 +14,7 @@ import argparse
 import copy
 import threading
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,20 +38,25 @@ from vdgs.viewer.viewer_scene import REST_ERROR_PX, REST_MAX_COST, ViewerScene
 MOVES_PER_SECOND = 60
 #: Rows of full detail that are drawn at once, and samples of a pixel each way.
 STRIP_ROWS, SAMPLES = 16, 4
+#: What is near enough to full detail, in dB.
+NEAR_DB = 35.0
+#: A visitor who moves on while a picture becomes better does so after so many seconds.
+INTERRUPT_SECONDS = (0.6, 1.1, 1.6, 2.1)
 
 
 class Visitor:
     """Takes the pictures of a scheduler, with their times."""
 
     def __init__(self, scene: ViewerScene) -> None:
-        self.scheduler, self.frames = RenderScheduler(), list[tuple[float, RenderedFrame]]()
+        #: With the time of the clock and of the processors.
+        self.scheduler, self.frames = RenderScheduler(), list[tuple[float, float, RenderedFrame]]()
         self._came = threading.Condition()
         self.session = self.scheduler.add_session(Painter(scene), self._take, self._fail)
         threading.Thread(target=self.scheduler.run, daemon=True).start()
 
     def _take(self, frame: RenderedFrame) -> None:
         with self._came:
-            self.frames.append((time.monotonic(), frame))
+            self.frames.append((time.monotonic(), time.process_time(), frame))
             self._came.notify_all()
 
     def _fail(self, error: Exception) -> None:
@@ -65,10 +70,28 @@ class Visitor:
         with self._came:
             before = len(self.frames)
             while True:
-                found = [each for each in self.frames[before:] if each[1].is_full or not full]
-                if found:
-                    return found[0]
+                for when, _, frame in self.frames[before:]:
+                    if frame.is_full or not full:
+                        return when, frame
                 self._came.wait()
+
+    def whole(self) -> None:
+        """Wait until the picture at rest is drawn in full detail."""
+        with self._came:
+            while self.session.full_due:
+                self._came.wait(0.05)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture at rest, and what had passed by then: by the clock, and (in brackets) of the processors."""
+
+    seconds: float
+    processor_seconds: float
+    image: np.ndarray
+
+    def __str__(self) -> str:
+        return f"{self.seconds:.1f} s ({self.processor_seconds:.1f} s)"
 
 
 def main() -> None:
@@ -90,25 +113,14 @@ def main() -> None:
     when, _ = visitor.wait(full=False)
     begun = time.time() - psutil.Process().create_time() - (time.monotonic() - when)
     print(f"first picture after {begun:.1f} s ({time.process_time():.1f} s of a processor); {memory()}", flush=True)
-    rested = {}
+    rested = dict[str, list[Picture]]()
     for name, camera in places.items():
-        used = time.process_time()
-        rate, pixels, errors = fly(visitor, tree, camera, options.seconds)
-        each = (time.process_time() - used) / max(rate * options.seconds, 1)
-        began, used = time.monotonic(), time.process_time()
-        visitor.ask(camera)
-        when, frame = visitor.wait(full=True)
-        rested[name] = frame.image
-        print(
-            f"{name}: {rate:.1f} pictures a second in motion ({each * 1000:.0f} ms of a processor each, "
-            f"{pixels / 1000:.0f} thousand pixels, {errors:.1f} px off at most), at rest after {when - began:.2f} s "
-            f"({time.process_time() - used:.2f} s of a processor); {memory()}",
-            flush=True,
-        )
+        fly(visitor, name, tree, camera, options.seconds)
+        rested[name] = rest(visitor, name, camera)
     if options.flight:
         fly_down(tree, places, options.flight)
     for name, camera in () if options.motion_only else places.items():
-        compare(name, rested[name] / 255.0, tree, camera, scene.pixel_at_camera_height)
+        compare(name, rested[name], tree, camera, scene.pixel_at_camera_height)
 
 
 def standpoints(tree: LodScene, width: int, height: int) -> dict[str, Camera]:
@@ -133,19 +145,54 @@ def standpoints(tree: LodScene, width: int, height: int) -> dict[str, Camera]:
     }
 
 
-def fly(visitor: Visitor, tree: LodScene, camera: Camera, seconds: float) -> tuple[float, float, float]:
-    """Move sideways about a place: pictures a second, their pixels, and how many pixels their cut may be off."""
-    began, first = time.monotonic(), len(visitor.frames)
+def fly(visitor: Visitor, name: str, tree: LodScene, camera: Camera, seconds: float) -> None:
+    """Move sideways about a place: print pictures a second, their pixels, and how many pixels their cut may be off."""
+    began, used, first = time.monotonic(), time.process_time(), len(visitor.frames)
     while (passed := time.monotonic() - began) < seconds:
-        pose = np.array(camera.camera_from_world)
-        pose[0, 3] += 0.1 * np.sin(2 * passed) * np.linalg.norm(pose[:3, 3]) * 0.1
-        visitor.ask(replace(camera, camera_from_world=pose))
+        visitor.ask(moved(camera, 0.01 * np.sin(2 * passed)))
         time.sleep(1 / MOVES_PER_SECOND)
-    shown = [frame for _, frame in visitor.frames[first:] if not frame.is_full]
+    used = time.process_time() - used
+    shown = [frame for _, _, frame in visitor.frames[first:] if not frame.is_full]
     pixels = float(np.median([frame.image.shape[0] * frame.image.shape[1] for frame in shown] or [0]))
     small = camera.limit_size(max(1, round(camera.width * np.sqrt(pixels / camera.width / camera.height))))
-    anchors = visitor.session.painter.drawn_anchors
-    return len(shown) / seconds, pixels, tree.within(small, anchors * 8 + 1).max_error_px
+    errors = tree.within(small, visitor.session.painter.drawn_anchors * 8 + 1).max_error_px
+    print(
+        f"{name}: {len(shown) / seconds:.1f} pictures a second in motion ({used / max(len(shown), 1) * 1000:.0f} ms of "
+        f"a processor each, {pixels / 1000:.0f} thousand pixels, {errors:.1f} px off at most)",
+        flush=True,
+    )
+
+
+def moved(camera: Camera, share: float) -> Camera:
+    """The camera a part of its distance from the middle of the scene farther sideways."""
+    pose = np.array(camera.camera_from_world)
+    pose[0, 3] += share * np.linalg.norm(pose[:3, 3])
+    return replace(camera, camera_from_world=pose)
+
+
+def rest(visitor: Visitor, name: str, camera: Camera) -> list[Picture]:
+    """The pictures of a camera at rest with their times, printed, and how soon one is there for who moves on before
+    the last of them."""
+    began, used, first = time.monotonic(), time.process_time(), len(visitor.frames)
+    visitor.ask(camera)
+    when, _ = visitor.wait(full=True)
+    print(
+        f"{name}: at rest after {when - began:.2f} s ({time.process_time() - used:.2f} s of a processor); {memory()}",
+        flush=True,
+    )
+    visitor.whole()
+    pictures = [Picture(at - began, cpu - used, each.image) for at, cpu, each in visitor.frames[first:] if each.is_full]
+    print(f"{name}: in full detail after {pictures[-1]}; {memory()}", flush=True)
+    waits = list[str]()
+    for number, seconds in enumerate(INTERRUPT_SECONDS):
+        visitor.ask(moved(camera, 0.001 * (number + 1)))
+        visitor.wait(full=True)
+        time.sleep(seconds)
+        began = time.monotonic()
+        visitor.ask(moved(camera, 0.001 * (number + 1.5)))
+        waits.append(f"{(visitor.wait(full=False)[0] - began) * 1000:.0f}")
+    print(f"{name}: who moves on meanwhile gets a picture after {', '.join(waits)} ms; {memory()}", flush=True)
+    return pictures
 
 
 def fly_down(tree: LodScene, places: dict[str, Camera], steps: int) -> None:
@@ -182,12 +229,20 @@ def draw_cut(scene: LodScene, camera: Camera, cut: LodCut) -> Raster:
     return render(replace(scene, tree=tree), camera)
 
 
-def compare(name: str, shown: np.ndarray, tree: LodScene, camera: Camera, pixel: float) -> None:
+def compare(name: str, rested: list[Picture], tree: LodScene, camera: Camera, pixel: float) -> None:
     """Print what a picture at rest lacks."""
     at_rest = tree.at_error(REST_ERROR_PX).within(camera, REST_MAX_COST)
     every = tree.at_error(0.0)
     exact, aliased = (full_detail(each, camera, 1) for each in (every.without_aliasing(pixel), every))
     fine = full_detail(every, camera, SAMPLES)
+    shown = rested[0].image / 255.0
+    course = [(each, psnr(each.image / 255.0, exact)) for each in rested]
+    near = next((each for each, found in course if found >= NEAR_DB), None)
+    print(
+        f"{name}: {NEAR_DB:g} dB " + (f"after {near}" if near else "never") + ": ",
+        ", ".join(f"{each} {found:.1f} dB" for each, found in course),
+        flush=True,
+    )
     print(
         f"{name}: {psnr(shown, exact):.1f} dB against full detail without aliasing, {psnr(shown, fine):.1f} dB against "
         f"it with {SAMPLES**2} samples a pixel (full detail itself: {psnr(exact, fine):.1f} dB, with aliasing "

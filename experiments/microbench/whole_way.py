@@ -97,7 +97,7 @@ def commands(scene: Scene, data: Path, work: Path, settings: list[str]) -> dict[
     elif scene.folder.startswith("photographs/"):
         stages["sfm"] = ["sfm", str(capture), "--output", str(work / "capture")]
         capture = work / "capture"
-    chosen = ["--images", scene.images] if scene.images else []
+    chosen = ["--images", scene.images] if scene.images and "--images" not in settings else []
     stages["train-coarse"] = ["train-coarse", str(capture), "--output", str(run), *chosen, *settings]
     return stages | {stage: [stage, str(run)] for stage in STAGES}
 
@@ -131,6 +131,8 @@ def run_scene(scene: Scene, arguments: argparse.Namespace, done: set[tuple[str, 
                 version,
                 measure([sys.executable, "-m", module, verb, *words], work / "log", source),
             )
+        if stage == arguments.last_stage:
+            return
     if arguments.beside and (scene.name, "beside", "other") not in done:
         capture = (
             arguments.data / scene.folder if (arguments.data / scene.folder / "sparse").is_dir() else work / "capture"
@@ -198,12 +200,13 @@ def main() -> None:
     parser.add_argument(
         "--scenes", nargs="+", choices=[scene.name for scene in SCENES], default=[s.name for s in SCENES]
     )
+    parser.add_argument("--last-stage", help="end with this stage, such as sfm")
     parser.add_argument("--before", type=Path, help="checkout of the version to compare with")
     parser.add_argument(
         "--settings",
         type=shlex.split,
         default=["--preset", "laptop"],
-        help="options of train-coarse; --config FILE holds those of the blocks too",
+        help="options of train-coarse; --config FILE holds those of the blocks too, --images goes before the scene's",
     )
     parser.add_argument("--beside", help="command of another program, with {capture} and {output}")
     parser.add_argument("--table", action="store_true", help="only print the table of what is measured")

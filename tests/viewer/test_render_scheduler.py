@@ -45,11 +45,15 @@ class Slow:
     def update_depth_range(self, display: DisplayOptions, full_camera: Camera) -> None:
         self.settled += 1
 
+    def parts_in_detail(self, display: DisplayOptions, camera: Camera) -> list[Camera]:
+        return []
+
     def paint(
-        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
-    ) -> np.ndarray:
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None,
+        *, full_detail: bool = False,
+    ) -> np.ndarray:  # fmt: skip
         self.clock.now += self.per_px * camera.width * camera.height
-        return np.zeros((camera.height, camera.width, 3), np.uint8)
+        return np.full((camera.height, camera.width, 3), full_detail, np.uint8)
 
 
 @pytest.fixture
@@ -127,8 +131,9 @@ class Decoding(Slow):
         self.per_anchor, self.times = per_anchor, [1, 5, 15, 45]
 
     def paint(
-        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
-    ) -> np.ndarray:
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None,
+        *, full_detail: bool = False,
+    ) -> np.ndarray:  # fmt: skip
         counts = [100_000 // times for times in self.times]
         self.drawn_anchors = (
             counts[0] if max_anchors is None else next((c for c in counts if c <= max_anchors), counts[-1])
@@ -197,6 +202,48 @@ def test_a_full_picture_of_much_is_drawn_in_parts(studio):
         steps += 1
     assert steps == 5
     assert frames[-1].image.shape == (960, 1280, 3)
+
+
+class Detailed(Slow):
+    """A painter whose pictures become better in eight parts."""
+
+    def cache_key(self, display: DisplayOptions) -> object:
+        return "one scene"
+
+    def parts_in_detail(self, display: DisplayOptions, camera: Camera) -> list[Camera]:
+        return [camera.cropped(160 * x, 0, 160 * (x + 1), camera.height) for x in range(8)]
+
+
+def test_who_rests_gets_full_detail_part_by_part_until_a_move(studio):
+    studio, clock = studio
+    one, other, mover = (sit(studio, Detailed(clock, 2e-6)) for _ in range(3))
+    for seat, x in ((one[0], 0), (other[0], 0), (mover[0], 1)):
+        studio.request_frame(seat, camera_at(x, 0, width=1280), DisplayOptions())
+    clock.now += REST_SECONDS
+    while not all(frames and frames[-1].is_full for _, frames, _ in (one, other, mover)):
+        studio.step()
+    assert not any(frames[-1].image.any() for _, frames, _ in (one, other, mover))  # nobody waits for others' detail
+    while not one[1][-1].image.any():
+        assert studio.step() == 0
+    assert 0 < one[1][-1].image.mean() < 1  # a part of it, after a second
+    before = len(mover[1])
+    studio.request_frame(mover[0], camera_at(2, 0, width=1280), DisplayOptions())
+    assert studio.step() == 0
+    assert len(mover[1]) == before + 1  # the next step is that of the camera that moves
+    studio.remove_session(mover[0])
+    while studio.step() == 0:
+        pass
+    for _, frames, errors in (one, other):
+        shares = [frame.image.mean() for frame in frames if frame.is_full]
+        assert shares == sorted(shares)
+        assert shares[-1] == 1
+        assert not errors
+    again = sit(studio, Detailed(clock, 2e-6))
+    studio.request_frame(again[0], camera_at(0, 0, width=1280), DisplayOptions())
+    clock.now += REST_SECONDS
+    while studio.step() == 0:
+        pass
+    assert [frame.image.mean() for frame in again[1] if frame.is_full] == [1]  # what others waited for is there
 
 
 def test_visitors_take_turns_and_moving_ones_go_first(studio):

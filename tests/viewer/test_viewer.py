@@ -83,18 +83,37 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
     seen = ViewerScene(scene.run, scene._open)
     seen.__dict__["blocks"] = quadrants()
     for layer in LAYERS:
-        painter, full = Painter(seen), DisplayOptions(layer, full_detail=True)
+        painter = Painter(seen)
         whole = Painter(scene).paint(DisplayOptions(layer), camera, camera)
-        rows = [painter.paint(full, camera.cropped(0, a, camera.width, b), camera) for a, b in ((0, 13), (13, 48))]
-        assert np.abs(np.concatenate(rows).astype(int) - whole).mean() < 3, layer
+        parts = painter.parts_in_detail(DisplayOptions(layer), camera)
+        assert len(parts) == (0 if layer == "error" else len(seen.parts_in_detail("merged", camera)))
+        refined = draw_parts(painter, DisplayOptions(layer), camera, parts or [camera])
+        assert np.abs(refined.astype(int) - whole).mean() < 3, layer
         quick = painter.paint(DisplayOptions(layer), camera, camera, 200)
         assert 0 < painter.drawn_anchors <= 200
         assert np.abs(quick.astype(int) - whole).mean() < 60, layer
-    exact = Painter(seen).paint(DisplayOptions("color", full_detail=True, min_visibility=0), camera, camera)
+    painter, plain = Painter(seen), DisplayOptions(min_visibility=0)
+    exact = painter.paint(plain, camera, camera, full_detail=True)
     assert np.array_equal(exact, shown(scene, model, camera))
+    monkeypatch.setattr(viewer_scene, "PART_MAX_ANCHORS", 300)
+    parts = painter.parts_in_detail(plain, camera)
+    assert len(parts) > 4
+    assert np.array_equal(draw_parts(painter, plain, camera, parts), exact)  # the parts are all of it, each once
+    both = DisplayOptions(model="both", split=0.4)
+    whole = painter.paint(both, camera, camera, full_detail=True)
+    assert np.array_equal(draw_parts(painter, both, camera, parts), whole)
     near = pick_position(seen.shown("merged"), camera, 32.5, 20.5)
     assert near is not None
     assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3
+
+
+def draw_parts(painter, display, camera, parts):
+    """A picture drawn in full detail from its parts, -1 where none is."""
+    drawn = np.full((camera.height, camera.width, 3), -1)
+    for part in parts:
+        x, y = round(camera.cx - part.cx), round(camera.cy - part.cy)
+        drawn[y : y + part.height, x : x + part.width] = painter.paint(display, part, camera, full_detail=True)
+    return drawn
 
 
 def test_what_few_cameras_see_fades_out(scene):

@@ -62,6 +62,17 @@ class LodScene:
         """The same scene, coarser where a view would cost more than so many merged Gaussians."""
         return self.at_error(self.tree.error_within(camera, self.max_error_px, max_cost))
 
+    def in_detail(self, cache_bytes: int) -> LodScene:
+        """The same scene drawn from all anchors, with memory of its own: what this one keeps stays there."""
+        tree = self.tree.with_own_cache(cache_bytes)
+        return replace(self, tree=tree, max_error_px=0.0, view=None, _anchors={}, _gaussians={})
+
+    def parts_in_detail(self, camera: Camera, max_anchors: int, min_px: int) -> list[Camera]:
+        """The parts of a view in which it is drawn from all anchors (`LodTree.parts_in_detail`)."""
+        seen = replace(camera, photograph_pixel=self.model.photograph_pixel)
+        parts = self.tree.parts_in_detail(seen, max_anchors, min_px)
+        return [replace(part, photograph_pixel=camera.photograph_pixel) for part in parts]
+
     def for_view(self, view: Camera) -> LodScene:
         """The same scene for pictures of parts of a view, one after another."""
         return replace(self, view=view)

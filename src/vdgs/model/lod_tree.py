@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -127,6 +128,29 @@ class LodTree:
         # Nodes are refined from the largest error on; the first that must not be is drawn as it is.
         over = np.flatnonzero((costs > max_cost) & visible[order])
         return max(least_px, float(errors[order[over[0]]])) if len(over) else least_px
+
+    def parts_in_detail(self, camera: Camera, max_anchors: int, min_px: int) -> list[Camera]:
+        """The parts of a view in which it is drawn from all anchors, from its middle on: in halves until the leaves
+        of each hold at most so many, or it is at most so many pixels wide and high."""
+        rest, found = [(0, 0, camera.width, camera.height)], list[Camera]()
+        while rest:
+            left, top, right, bottom = rest.pop()
+            part = camera.cropped(left, top, right, bottom)
+            if max(part.width, part.height) <= min_px or self.table.anchors[self.visible(part)].sum() <= max_anchors:
+                found.append(part)
+            elif part.width >= part.height:
+                middle = (left + right) // 2
+                rest += [(left, top, middle, bottom), (middle, top, right, bottom)]
+            else:
+                middle = (top + bottom) // 2
+                rest += [(left, top, right, middle), (left, middle, right, bottom)]
+        return sorted(found, key=lambda part: np.hypot(part.cx - part.width / 2, part.cy - part.height / 2))
+
+    def with_own_cache(self, cache_bytes: int) -> LodTree:
+        """The same tree, whose nodes do not take the place of those that this one keeps in memory."""
+        other = copy(self)
+        other._cache = _NodeCache(cache_bytes)
+        return other
 
     def gaussians(self, node: int) -> Gaussians:
         """The merged Gaussians of a node."""

@@ -198,9 +198,6 @@ class ClientSession:
         self._model_choice.on_update(lambda _: self._choose_model())
         self._model_split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
         self._model_split.on_update(lambda _: self.change_display(split=float(self._model_split.value)))
-        has_tree = self.scene.tree(self.scene.names[0]) is not None
-        full_detail = gui.add_checkbox("Full detail at rest", False, visible=has_tree)
-        full_detail.on_update(lambda _: self.change_display(full_detail=bool(full_detail.value)))
         self._image_split = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
         self._image_split.on_update(lambda _: self.change_display(image_split=float(self._image_split.value)))
         trust = gui.add_slider(

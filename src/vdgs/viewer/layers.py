@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -55,8 +56,6 @@ class DisplayOptions:
     #: A photograph, by its number, laid over the image left of `image_split`; None: no photograph.
     image_index: int | None = None
     image_split: float = 0.5
-    #: Draw views at rest from all anchors, also where the run has a level-of-detail tree.
-    full_detail: bool = False
     #: The scene fades out where fewer training cameras see it.
     min_visibility: int = FADE_BELOW
     #: In the layer `color`: mark what fewer than three training cameras see.
@@ -106,33 +105,49 @@ class Painter:
 
     def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int:
         """How many anchors a full image is drawn from."""
-        names = self._scene.names if self._shows_both(display) else [self._scene.shown_name(display.model)]
         return sum(
-            self._scene.get_level(name, camera, full_detail=display.full_detail, min_visibility=display.min_visibility)[
-                1
-            ]
-            for name in names
+            self._scene.get_level(name, camera, min_visibility=display.min_visibility)[1]
+            for name in self._shown_names(display)
         )
 
+    def parts_in_detail(self, display: DisplayOptions, camera: Camera) -> list[Camera]:
+        """The parts of a full image that `paint` draws better in full detail; none where it is whole."""
+        if display.layer == "error":  # drawn at the error of a view at rest
+            return []
+        parts = (
+            self._scene.parts_in_detail(name, camera, display.min_visibility) for name in self._shown_names(display)
+        )
+        return max(parts, key=len)
+
     def paint(
-        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
-    ) -> UInt8[np.ndarray, "h w 3"]:
-        """An image, or rows of it: `camera` is `full_camera` or cropped from it, all columns."""
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None,
+        *, full_detail: bool = False,
+    ) -> UInt8[np.ndarray, "h w 3"]:  # fmt: skip
+        """An image, or a part of it: `camera` is `full_camera` or cropped from it. With at most so many anchors, or in
+        full detail from all of them; else as at first when a camera rests."""
         self.drawn_anchors = 0
+        draw = partial(
+            self._render_model, display=display, full_camera=full_camera, max_anchors=max_anchors,
+            full_detail=full_detail,
+        )  # fmt: skip
         if self._shows_both(display):
-            image = self._side_by_side(display, camera, full_camera, max_anchors)
+            image = self._side_by_side(display, camera, full_camera, draw)
         else:
-            image = self._render_model(self._scene.shown_name(display.model), display, camera, full_camera, max_anchors)
-        return image if display.image_index is None else self._with_image(display, camera, image)
+            image = draw(self._scene.shown_name(display.model), camera=camera)
+        return image if display.image_index is None else self._with_image(display, camera, full_camera, image)
+
+    def _shown_names(self, display: DisplayOptions) -> Sequence[str]:
+        return self._scene.names if self._shows_both(display) else [self._scene.shown_name(display.model)]
 
     def _shows_both(self, display: DisplayOptions) -> bool:
         return display.model == "both" and len(self._scene.names) > 1
 
     def _render_model(
-        self, name: str, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None
-    ) -> UInt8[np.ndarray, "h w 3"]:
+        self, name: str, *, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None,
+        full_detail: bool,
+    ) -> UInt8[np.ndarray, "h w 3"]:  # fmt: skip
         level, count = self._scene.get_level(
-            name, camera, max_anchors, full_camera=full_camera, full_detail=display.full_detail,
+            name, camera, max_anchors, full_camera=full_camera, full_detail=full_detail,
             min_visibility=display.min_visibility,
         )  # fmt: skip
         self.drawn_anchors += count
@@ -166,32 +181,36 @@ class Painter:
         return self._comparison.error_map(name, camera, full_camera)
 
     def _side_by_side(
-        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, draw: Callable[..., np.ndarray]
     ) -> UInt8[np.ndarray, "h w 3"]:
-        edge = split_column(display.split, camera.width)
+        edge = split_column(display.split, camera, full_camera)
+        middle = min(max(edge, 0), camera.width)
         parts = []
-        for name, left, right in (("coarse", 0, edge), ("merged", edge, camera.width)):
+        for name, left, right in (("coarse", 0, middle), ("merged", middle, camera.width)):
             if left < right:
-                part = camera.cropped(left, 0, right, camera.height)
-                parts.append(self._render_model(name, display, part, full_camera, max_anchors))
+                parts.append(draw(name, camera=camera.cropped(left, 0, right, camera.height)))
         return _draw_divider(np.concatenate(parts, axis=1), edge)
 
-    def _with_image(self, display: DisplayOptions, camera: Camera, rendered: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+    def _with_image(
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, rendered: np.ndarray
+    ) -> UInt8[np.ndarray, "h w 3"]:
         assert display.image_index is not None
-        edge = split_column(display.image_split, camera.width)
+        edge = split_column(display.image_split, camera, full_camera)
         photograph, covered = warp_image(self._scene, display.image_index, camera)
-        covered[:, edge:] = False
+        covered[:, max(edge, 0) :] = False
         return _draw_divider(np.where(covered[..., None], photograph, rendered), edge)
 
 
-def split_column(split: float, width: int) -> int:
-    """The column at which an image is split."""
-    return round(min(max(split, 0.0), 1.0) * width)
+def split_column(split: float, camera: Camera, full_camera: Camera) -> int:
+    """The column of a part of an image at which all of it is split, also beyond the part; more than its width where
+    nothing is right of the split."""
+    column = round(min(max(split, 0.0), 1.0) * full_camera.width)
+    return column + (column == full_camera.width) - round(full_camera.cx - camera.cx)
 
 
 def _draw_divider(image: np.ndarray, edge: int) -> UInt8[np.ndarray, "h w 3"]:
     """With a line where two images meet."""
-    if 0 < edge < image.shape[1]:
+    if 0 < edge <= image.shape[1]:
         image = image.copy()
         image[:, edge - 1 : edge] = _DIVIDER_COLOR
     return image

@@ -1,7 +1,8 @@
 """Draws for all clients in one thread: small previews while a camera moves, the full image once it rests.
 
-The kernels use all cores themselves. Clients take turns, previews before the next rows of full images. A new request
-of a client replaces its last one, and work begun for that is dropped.
+The kernels use all cores themselves. Clients take turns, previews before the next rows of full images, and these before
+parts of full images that are drawn again in full detail. A new request of a client replaces its last one, and work
+begun for that is dropped.
 
 The more cameras move, the less time each preview gets, so that a round of all stays short (`ROUND_SECONDS`). The time
 follows from the anchors drawn, and from pixels only where anchors are few: each session learns its seconds per anchor
@@ -14,7 +15,7 @@ import gc
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Generator, Hashable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 from itertools import pairwise
@@ -41,6 +42,8 @@ SPEED_SMOOTHING = 0.4
 #: Rows of a full image are drawn for so long before others have their turn, and from about so many anchors at once,
 #: for decoded anchors take memory.
 TURN_SECONDS, ANCHORS_PER_TURN, MAX_TURNS = 0.1, 40_000, 24
+#: A full image that becomes better is sent so often.
+DETAIL_SECONDS = 1.0
 #: Full images that are cached for other clients with the same view.
 MAX_CACHED_IMAGES = 3
 #: Memory is given back after so many idle seconds, or when so many clients have left.
@@ -59,9 +62,11 @@ class PainterProtocol(Protocol):
     def update_depth_range(self, display: DisplayOptions, full_camera: Camera) -> None: ...
     def cache_key(self, display: DisplayOptions) -> Hashable: ...
     def count_visible_anchors(self, display: DisplayOptions, camera: Camera) -> int: ...
+    def parts_in_detail(self, display: DisplayOptions, camera: Camera) -> list[Camera]: ...
     def paint(
-        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None
-    ) -> np.ndarray: ...
+        self, display: DisplayOptions, camera: Camera, full_camera: Camera, max_anchors: int | None = None,
+        *, full_detail: bool = False,
+    ) -> np.ndarray: ...  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +79,14 @@ class RenderedFrame:
     #: The view that it shows, at full size.
     camera: Camera
     display: DisplayOptions
+
+
+@dataclass(eq=False)
+class FullImage:
+    """A full image that is cached, and the parts of it that are still to be drawn in full detail."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    parts: deque[Camera]
 
 
 @dataclass(eq=False, kw_only=True)
@@ -92,6 +105,8 @@ class RenderSession:
     moved_at: float = 0.0
     #: A full image that is being drawn.
     job: Iterator[None] | None = None
+    #: The full image is there, and becomes better.
+    adds_detail: bool = False
     #: Pixels that a preview may have, learned from the time of previews.
     preview_pixels: float = 320 * 240
     #: Seconds of a preview for each of its anchors; 0 before there was any.
@@ -107,7 +122,7 @@ class RenderScheduler:
         self._clock = clock
         self._sessions: list[RenderSession] = []
         self._tasks: deque[tuple[Future[Any], Callable[[], None]]] = deque()
-        self._full_images: OrderedDict[Hashable, np.ndarray] = OrderedDict()
+        self._full_images: OrderedDict[Hashable, FullImage] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
         self._left = 0
@@ -133,7 +148,7 @@ class RenderScheduler:
         with self._changed:
             session.requested, session.moved_at = (camera, display), self._clock()
             session.preview_due = session.full_due = True
-            session.job = None
+            session.job, session.adds_detail = None, False
             self._changed.notify()
 
     def submit(self, function: Callable[[], _Result]) -> Future[_Result]:
@@ -213,7 +228,10 @@ class RenderScheduler:
 
     def _next(self, now: float) -> RenderSession | None:
         """The session whose turn it is; it goes to the end of the queue."""
-        for is_due in (lambda s: s.preview_due, lambda s: s.full_due and now - s.moved_at >= REST_SECONDS - 1e-6):
+        rest = [each for each in self._sessions if each.full_due and now - each.moved_at >= REST_SECONDS - 1e-6]
+        for is_due in (
+            lambda s: s.preview_due, lambda s: s in rest and not s.adds_detail, lambda s: s in rest
+        ):  # fmt: skip
             for session in self._sessions:
                 if session.requested is not None and is_due(session):
                     self._sessions.remove(session)
@@ -248,7 +266,7 @@ class RenderScheduler:
         return min(PREVIEW_SECONDS, max(ROUND_SECONDS / max(moving, 1), MIN_PREVIEW_SECONDS))
 
     def _draw_next_rows(self, session: RenderSession) -> None:
-        """The next rows of a full image."""
+        """The next rows of a full image, or the next part of it in full detail."""
         with self._changed:
             if session.requested is None:
                 return
@@ -259,13 +277,29 @@ class RenderScheduler:
                 session.job, session.full_due = None, False
 
     def _draw_full(self, session: RenderSession, full_camera: Camera, display: DisplayOptions) -> Iterator[None]:
-        """Draw a full image, turn by turn, and deliver it unless there is a newer request by then."""
+        """Draw a full image, turn by turn, and deliver it unless there is a newer request by then; then the same in
+        full detail."""
         session.painter.update_depth_range(display, full_camera)
         key = (camera_key(full_camera), display, session.painter.cache_key(display))
-        if key in self._full_images:
-            self._full_images.move_to_end(key)
-            session.on_frame(RenderedFrame(self._full_images[key], True, full_camera, display))
-            return
+        full = self._full_images.pop(key, None)
+        if full is None:
+            image = yield from self._draw_rows(session, full_camera, display)
+            full = FullImage(image, deque(session.painter.parts_in_detail(display, full_camera)))
+        self._full_images[key] = full
+        while len(self._full_images) > MAX_CACHED_IMAGES:
+            self._full_images.popitem(last=False)
+        with self._changed:
+            if session.requested != (full_camera, display):
+                return
+            session.adds_detail = True
+        image = full.image.copy() if full.parts else full.image
+        session.on_frame(RenderedFrame(image, True, full_camera, display))
+        yield from self._add_detail(session, full, full_camera, display)
+
+    def _draw_rows(
+        self, session: RenderSession, full_camera: Camera, display: DisplayOptions
+    ) -> Generator[None, None, np.ndarray]:
+        """Draw a full image, some rows in each turn."""
         turns = round(session.seconds_per_pixel * full_camera.width * full_camera.height / TURN_SECONDS)
         turns = max(turns, -(-session.painter.count_visible_anchors(display, full_camera) // ANCHORS_PER_TURN), 1)
         turns = min(turns, MAX_TURNS, full_camera.height)
@@ -279,11 +313,26 @@ class RenderScheduler:
             if bottom != full_camera.height:
                 yield
         session.seconds_per_pixel = seconds / (full_camera.width * full_camera.height)
-        image = self._full_images[key] = np.concatenate(parts)
-        while len(self._full_images) > MAX_CACHED_IMAGES:
-            self._full_images.popitem(last=False)
-        if session.requested == (full_camera, display):
-            session.on_frame(RenderedFrame(image, True, full_camera, display))
+        return np.concatenate(parts)
+
+    def _add_detail(
+        self, session: RenderSession, full: FullImage, full_camera: Camera, display: DisplayOptions
+    ) -> Iterator[None]:
+        """Draw a full image again in full detail, a part in each turn, and deliver what has come of it every second and
+        at last. Clients with equal views share the parts."""
+        sent_at, left = self._clock(), len(full.parts)
+        while full.parts or left:
+            yield
+            if full.parts:
+                part = full.parts.popleft()
+                x, y = round(full_camera.cx - part.cx), round(full_camera.cy - part.cy)
+                drawn = session.painter.paint(display, part, full_camera, full_detail=True)
+                full.image[y : y + part.height, x : x + part.width] = drawn
+            if session.requested != (full_camera, display):
+                return
+            if not full.parts or self._clock() - sent_at >= DETAIL_SECONDS:
+                session.on_frame(RenderedFrame(full.image.copy(), True, full_camera, display))
+                sent_at, left = self._clock(), len(full.parts)
 
 
 def camera_key(camera: Camera) -> Hashable:

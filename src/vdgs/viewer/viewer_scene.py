@@ -35,6 +35,9 @@ ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
 #: (choice: below it, at most a second on two cores).
 REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 2_000_000
+#: A view at rest is then drawn from all anchors, in parts whose leaves hold at most so many or which are so small, in
+#: pixels: a part takes about 50 ms on two cores (measured). Leaves take so much memory meanwhile.
+PART_MAX_ANCHORS, PART_MIN_PX, PART_CACHE_BYTES = 40_000, 16, 64 << 20
 #: Photographs kept in memory, decoded (choice).
 _IMAGE_CACHE_BYTES = 128 << 20
 #: What a camera meters is drawn from at most about so many anchors (choice): fitting its law takes up to two hundred
@@ -57,6 +60,8 @@ class ViewerScene:
         self._trees: dict[str, LodScene | None] = {}
         #: The last that was asked for.
         self._faded_trees: dict[tuple[str, int], LodScene] = {}
+        #: Trees that draw all anchors, by the same key.
+        self._detailed_trees: dict[tuple[str, int], LodScene] = {}
         self._values: dict[tuple[str, NodeContent], Tensor] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
@@ -103,14 +108,27 @@ class ViewerScene:
         tree = self._faded_tree(name, min_visibility)
         if tree is None:
             return self._pyramid(name, min_visibility).of(camera, max_anchors)
-        if full_detail and max_anchors is None:
-            tree = tree.at_error(0.0)
+        if full_detail:
+            tree = self._detailed(name, min_visibility, tree)
         else:
             least = REST_ERROR_PX if max_anchors is None else PREVIEW_ERROR_PX
             cost = REST_MAX_COST if max_anchors is None else max_anchors * ANCHOR_COST
             view = full_camera or camera
             tree = tree.at_error(least).within(view, cost).for_view(view)
         return LodLevel(tree), max(1, tree.cost(camera) // ANCHOR_COST)
+
+    def parts_in_detail(self, name: str, camera: Camera, min_visibility: int = 0) -> list[Camera]:
+        """The parts of a view that make it whole where `get_level` draws it coarser than the model is, from its middle
+        on; none for a model without a tree."""
+        tree = self._faded_tree(name, min_visibility)
+        return [] if tree is None else tree.parts_in_detail(camera, PART_MAX_ANCHORS, PART_MIN_PX)
+
+    def _detailed(self, name: str, min_visibility: int, tree: LodScene) -> LodScene:
+        """A tree that draws all anchors."""
+        key = (name, min_visibility)
+        if key not in self._detailed_trees:
+            self._detailed_trees = {key: tree.in_detail(PART_CACHE_BYTES)}
+        return self._detailed_trees[key]
 
     def _faded_tree(self, name: str, min_visibility: int) -> LodScene | None:
         """The tree of a model that fades out where fewer than so many training cameras see; None where it has none."""
@@ -181,7 +199,7 @@ class ViewerScene:
         self.run = run
         self._runs = {run.name: run}
         self._visibility, self._block_tints, self._levels, self._exposures = {}, {}, {}, {}
-        self._trees, self._faded_trees, self._values = {}, {}, {}
+        self._trees, self._faded_trees, self._detailed_trees, self._values = {}, {}, {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
