@@ -36,7 +36,7 @@ def plot_visibility_groups(file: Path, plan: BenchPlan, results: Sequence[BenchR
         return False
     width = max(0.4 + (PANEL_WIDTH + 0.75) * len(scenes), 7.5)
     columns = _columns([method.title for method in plan.methods], width - 0.75)
-    legend = 0.3 * -(-len(plan.methods) // columns) + 0.25
+    legend = 0.2 * -(-len(plan.methods) // columns) + 0.25
     height = PANEL_HEIGHT + 2.2 + legend
     figure = Figure(figsize=(width, height), dpi=DPI)
     canvas = FigureCanvasAgg(figure)

@@ -59,6 +59,9 @@ def test_every_departure_of_a_preset_is_listed_with_what_decided_it(preset: str)
 def test_every_choice_of_the_paper_has_a_row_and_a_setting() -> None:
     named = {name for row in rows(section("Choices")) for name in re.findall(r"`([a-z]+\.[\w.]+)`", row[2])}
     assert departures("paper") - named == set()
+    listed = set(re.findall(r"`([a-z]+\.[\w.]+)`", section("Choices"))) & settings()
+    leaves = {name for name in settings() if not any(other.startswith(f"{name}.") for other in settings())}
+    assert {name for name in leaves if not any(f"{name}.".startswith(f"{each}.") for each in listed)} == set()
     assert named <= settings()
 
 

@@ -37,7 +37,7 @@ class ModelConfig:
     the photographs' pixels ask for; one unless some are about three times as large as others, as in flights of several
     heights (choice)."""
     view_distance: bool = False
-    """Feed the distance between camera and anchor to the decoder too."""
+    """Feed the distance between camera and anchor to the decoder too (eq. 4). Experimental: not measured."""
     appearance_dim: Annotated[int, Range(0, 1024)] = 0
     """Size of the appearance embedding of each training image (color only); 0 for none. Experimental: not measured."""
     background_model: Literal["auto", "envmap", "off"] = "auto"
@@ -176,7 +176,8 @@ class TrainConfig:
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
     """How often each photograph is used. `uniform`: all alike (the paper). `visibility`: every anchor divides one vote
     among the cameras that see it, and photographs are used in proportion to their votes. `sqrt-visibility`: in
-    proportion to the square root of their votes, which keeps more photographs in use (choice)."""
+    proportion to the square root of their votes, which keeps more photographs in use (choice). In the coarse stage all
+    but `uniform` are experimental: they gained nothing in our trials."""
     resolution_schedule: ResolutionSchedule = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
     oblique_sampling: Annotated[float, Range(1, 1000)] = 1.0
@@ -260,7 +261,8 @@ class AssignmentConfig:
     mode: Literal["coverage", "paper", "leave-one-out", "frustum"] = "coverage"
     """How cameras are scored. `coverage`: share of the drawn pixels that the block alone draws alike (choice). `paper`:
     eq. 7 as printed, where pixels empty in both renders count too. `leave-one-out`: 1 - SSIM of the scene without the
-    block. `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
+    block (experimental: gained nothing in our tables). `frustum`: share of the block's anchors that the camera holds
+    (needs no renders)."""
     tau: Annotated[float, Range(0, 1, exclusive_min=True)] = 0.05
     """tau: pixels differ when the mean absolute difference of their channels is above this (choice)."""
     threshold: Annotated[float, FRACTION] = 0.45
@@ -292,8 +294,8 @@ class BlockConfig:
     """As in the coarse stage."""
     crop: Literal["off", "fixed-steps", "fixed-pixels"] = "off"
     """Draw only the part of each photograph that shows the block, and all of it in every fourth step. `fixed-steps`:
-    each step costs less; `fixed-pixels`: as many pixels are drawn as without, in up to four times more steps;
-    `iterations` then counts whole photographs (choice)."""
+    each step costs less (experimental: no table has it); `fixed-pixels`: as many pixels are drawn as without, in up to
+    four times more steps; `iterations` then counts whole photographs (choice)."""
     lr_scale_offsets: Annotated[float, FACTOR_RANGE] = 1.0
     """The rates of the coarse stage start again, those of offsets times this (CityGaussian: 0.4)."""
     lr_scale_log_scales: Annotated[float, FACTOR_RANGE] = 1.0

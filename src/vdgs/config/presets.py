@@ -1,7 +1,8 @@
 """Settings by name.
 
-`paper`     the paper as printed; where it is silent, the reading that served it best on validation views or, where
-            none was measured, that of Scaffold-GS. docs/paper.md lists every choice, with its alternatives.
+`paper`     the paper as printed, but for the input of the decoder; where it is silent, the reading that served it best
+            on validation views or, where none was measured, that of Scaffold-GS. docs/paper.md lists every choice, with
+            its alternatives.
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
             smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam; cameras by `coverage`,
             each with a block and each block with a hundred; and a frozen margin.
