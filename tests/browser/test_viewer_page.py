@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewe
 
 
 #: Width and height of the browser's window, and pixels of the screen for one of it.
-WINDOW, SCALE = (1000, 700), 0.5
+WINDOW, SCALE = (1000, 700), 0.25
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def in_window(visitor: ClientSession) -> Camera | None:
     camera = visitor.camera
     if camera is None or camera.width / camera.height != pytest.approx(WINDOW[0] / WINDOW[1], rel=0.01):
         return None
-    return camera.resized(*WINDOW)
+    return camera.resized(WINDOW[0] // 2, WINDOW[1] // 2)
 
 
 def beside_the_panel(picture: np.ndarray) -> np.ndarray:
@@ -105,7 +105,8 @@ def test_a_browser_shows_the_scene(visit):
     wait_until(lambda: "ground frame" in visitor.point_panel._label.content)
     place = visitor.point_panel._point
     assert place is not None
-    assert camera.project(place.position[None])[0][0] == pytest.approx((340.0, 440.0), abs=1.0)
+    where = camera.resized(*WINDOW).project(place.position[None])[0][0]
+    assert where == pytest.approx((340.0, 440.0), abs=1.0)
     page.drag((340.0, 440.0), (430.0, 400.0))
     wait_until(lambda: not np.allclose(visitor.camera.position, camera.position))
     wait_until(lambda: visit.differs() < 8)  # the mark of the place is in it now

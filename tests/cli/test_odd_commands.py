@@ -187,6 +187,22 @@ def test_a_cluster_that_does_not_answer_is_not_waited_for(address):
         check_reachable(address)
 
 
+def test_a_ray_of_this_machine_that_does_not_start_is_told_in_words(monkeypatch):
+    """Ray gives its node thirty seconds, and raises a bare Exception."""
+    ray = pytest.importorskip("ray")
+    from vdgs.distributed.ray_executor import connect
+
+    def slow(**_: object) -> None:
+        raise Exception("The current node timed out during startup.")
+
+    monkeypatch.setattr(ray, "init", slow)
+    with (
+        pytest.raises(VdgsError, match=r"local: no Ray cluster.*The current node timed out"),
+        connect("local"),
+    ):
+        pass
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

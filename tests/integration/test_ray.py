@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from support.clusters import (
     KILLED,
     MIDDLE,
     NODE_LOST,
+    QUICK_STARTS,
     Cluster,
     alive,
     copy_run,
@@ -25,7 +27,7 @@ from support.clusters import (
     shard_of,
     waiting_shards,
 )  # fmt: skip
-from support.commands import begun, do_tasks_here, python, vdgs, wait_until
+from support.commands import PATIENCE_SECONDS, Command, begun, do_tasks_here, python, vdgs, wait_until
 from vdgs import cli
 
 pytestmark = [
@@ -59,15 +61,19 @@ def another_code() -> None:
 def test_a_run_starts_a_ray_of_its_own_for_each_job():
     """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
     done = python(
-        """
-from vdgs.distributed.ray_executor import connect, list_nodes
+        f"""
+from support.ray_agents import wait_for_nodes
+from vdgs.distributed import ray_executor
+begin = ray_executor._ray_driver
+def patiently(*arguments):  # whose token is to be known before Ray is imported
+    wait_for_nodes({PATIENCE_SECONDS})
+    return begin(*arguments)
+ray_executor._ray_driver = patiently
 for _ in range(2):
-    with connect(None):
-        print(len(list_nodes()), "node")
+    with ray_executor.connect(None):
+        print(len(ray_executor.list_nodes()), "node")
 """,
-        RAY_enable_worker_prestart="0",
-        RAY_prestart_worker_first_driver="0",
-        RAY_agent_register_timeout_ms="600000",
+        **QUICK_STARTS,
     )
     assert done.stdout.splitlines() == ["1 node", "1 node"], done.stderr
 
@@ -80,33 +86,6 @@ def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, c
     assert "not the same code" in done.stderr
     assert not list(run.glob("blocks/*/output.log"))
     assert not list(run.glob(".fitness*"))
-
-
-def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, cluster, tmp_path):
-    """A node dies under a block, one that joins late takes it; a command is killed, then the worker that keeps it."""
-    run = copy_run(cut, tmp_path / "run")
-    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
-        processes = waiting_shards(driver, 2)
-        cluster.remove(cluster.node_of(processes[1]))
-        wait_until(lambda: not alive(processes[1]))
-        cluster.add("late")
-        processes = waiting_shards(driver, 3)
-        assert cluster.node_of(processes[1]) == "late"
-        os.kill(processes[0], signal.SIGKILL)
-        processes = waiting_shards(driver, 4)
-        # The driver knows of the second attempt: what it has not heard of yet it cannot lose.
-        wait_until(lambda: driver.printed().count("block 00: started") == 2)
-        os.kill(parent_of(processes[0]), signal.SIGKILL)
-        driver.wait_until_paused(5)
-        driver.go_on()
-        done = driver.finished()
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert models(run) == models(local)
-    assert re.search(f"block 01: {NODE_LOST}", done.stdout)
-    assert re.search(f"block 00: {KILLED}; continues from its last checkpoint, attempts left: 2", done.stdout)
-    assert "block 00: crashed by the loss of its worker" in done.stdout
-    assert "2 of 2 blocks done" in done.stdout
-    assert (run / "blocks/00/output.log").read_text().count("--- ") == 3
 
 
 def test_a_driver_that_was_killed_finds_its_shards_again_and_stops_them_when_asked(uncut, mapped, cluster, tmp_path):
@@ -133,41 +112,71 @@ def test_a_driver_that_was_killed_finds_its_shards_again_and_stops_them_when_ask
     assert evaluated(run / "maps") == mapped
 
 
-def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memory_and_a_slow_one_is_waited_for(
-    cut, local, cluster, tmp_path
-):
-    """One block stands still on the only node. The other goes to a node of another vdgs, which is named and avoided,
-    then to one whose memory Ray takes for full and that ends it itself, then to a larger one."""
+def more_retries() -> None:
+    """Let tasks be tried as often as one run can lose them."""
+    from vdgs.distributed import ray_executor
+
+    ray_executor.RayExecutor = partial(ray_executor.RayExecutor, retries=3)  # type: ignore[assignment,misc]
+
+
+def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, cluster, tmp_path):
+    """A block loses its node. Of those that join late one is of another vdgs, which is named and avoided, Ray takes the
+    memory of the next for full and ends the block itself, and a larger one takes it. Of the other block the command is
+    killed, then the worker that keeps it; at last it stands still, and is waited for."""
     run = copy_run(cut, tmp_path / "run")
-    for name in cluster.names[1:]:
-        cluster.remove(name)
     stranger = another_vdgs(tmp_path / "stranger")
-    with begun(*on_ray(run, cluster), "--mem-gb", "1", pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
-        driver.wait_until_paused(1)
-        (slow,) = driver.paused()
+    command = (*on_ray(run, cluster), "--mem-gb", "1")
+    with begun(*command, pause_at=(MIDDLE, 1), prepare=more_retries, environment=cluster.token) as driver:
+        processes = waiting_shards(driver, 2)
+        cluster.remove(cluster.node_of(processes[1]))
+        wait_until(lambda: not alive(processes[1]))
         cluster.add("stranger", {"PYTHONPATH": str(stranger)})
         wait_until(lambda: "crashed by a node that cannot work on the run" in driver.printed())
         full = {"RAY_memory_monitor_refresh_ms": "100", "RAY_memory_usage_threshold": "0.001"}
         cluster.add("small", full, memory=1 << 30)
         wait_until(lambda: "crashed by Ray, to free memory" in driver.printed())
+        cluster.remove("small")  # which the other block would fit
         cluster.add("large")
         wait_until(lambda: any(cluster.has(process, "large") for process in driver.paused()))
+        os.kill(processes[0], signal.SIGKILL)
+        again = waits_again(driver, 0, processes[0])
+        # The driver knows of the second attempt: what it has not heard of yet it cannot lose.
+        wait_until(lambda: driver.printed().count("block 00: started") == 2)
+        os.kill(parent_of(again), signal.SIGKILL)
+        slow = waits_again(driver, 0, processes[0], again)
         os.kill(slow, signal.SIGSTOP)
         driver.go_on()
-        wait_until((run / f"blocks/{1 - shard_of(slow):02d}/model.safetensors").exists)
+        wait_until((run / "blocks/01/model.safetensors").exists)
         os.kill(slow, signal.SIGCONT)
         done = driver.finished()
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
-    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
+    assert re.search(f"block 01: {NODE_LOST}", done.stdout)
+    assert done.stdout.count("block 01: crashed by a node that cannot work on the run") == 1
     assert "not the same code" in done.stdout
     assert "(out of memory; it asks for 1.50 GB now)" in done.stdout
+    assert re.search(f"block 00: {KILLED}; continues from its last checkpoint, attempts left: 3", done.stdout)
+    assert "block 00: crashed by the loss of its worker" in done.stdout
+    assert "2 of 2 blocks done" in done.stdout
+    assert (run / "blocks/00/output.log").read_text().count("--- ") == 3
+
+
+def waits_again(driver: Command, shard: int, *before: int) -> int:
+    """The process of a shard, or block, that waits now, when those before have ended."""
+    found = dict[int, int]()
+
+    def look() -> bool:
+        found.update(waiting_shards(driver, 1))
+        return found.get(shard, before[0]) not in before
+
+    wait_until(look)
+    return found[shard]
 
 
 def another_vdgs(folder: Path) -> Path:
     """A folder to import a vdgs from that differs by one file."""
     source = Path(cli.__file__).parents[1]
-    shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so"))
     (folder / "vdgs/of_another_version.py").touch()
     # An installation that leads to its sources by a hook would lead there from that node too.
     (folder / "sitecustomize.py").write_text(

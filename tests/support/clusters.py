@@ -52,6 +52,8 @@ SERVER = """
 import json, os, sys, warnings
 warnings.simplefilter("ignore")
 from ray.cluster_utils import Cluster
+from support.ray_agents import wait_for_nodes
+wait_for_nodes(float(sys.argv[1]))
 own = {"object_store_memory": 80 << 20, "memory": 8 << 30}
 head = {"num_cpus": 0, "include_dashboard": False, "include_log_monitor": False, "no_monitor": True}
 cluster = Cluster(initialize_head=True, head_node_args={**own, **head})
@@ -71,6 +73,14 @@ for node in nodes.values():
     cluster.remove_node(node, allow_graceful=False)
 cluster.shutdown()
 """
+#: What Ray is told where it starts.
+TESTS = Path(__file__).parents[1]
+QUICK_STARTS = {
+    # What nodes start can be paused, as `pausing` says.
+    "PYTHONPATH": os.pathsep.join(map(str, (TESTS / "support" / "startup", TESTS, TESTS.parent / "src"))),
+    "RAY_enable_worker_prestart": "0", "RAY_prestart_worker_first_driver": "0",
+    "RAY_agent_register_timeout_ms": "600000", "RAY_gcs_server_port_wait_time_s": "600",
+}  # fmt: skip
 
 
 class Cluster:
@@ -79,25 +89,18 @@ class Cluster:
     def __init__(self) -> None:
         #: With which a driver is let in; Ray listens on all addresses.
         self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-        here, source = Path(__file__).parents[1], Path(sys.modules["vdgs"].__file__ or "").parents[1]
-        paths = [
-            str(here / "support" / "startup"),
-            str(here),
-            str(source),
-        ]  # what nodes start can be paused, as `pausing` says
         environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(paths), "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0",
-            "RAY_enable_worker_prestart": "0", "RAY_prestart_worker_first_driver": "0", "PYTHONWARNINGS": "ignore",
+            "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0", "PYTHONWARNINGS": "ignore",
             # A node that is gone refuses to be asked, at once; one that is slow to answer is not taken for dead.
             "RAY_health_check_initial_delay_ms": "0", "RAY_health_check_period_ms": "1000",
             "RAY_health_check_failure_threshold": "2", "RAY_health_check_timeout_ms": "600000",
-            "RAY_gcs_rpc_server_reconnect_timeout_s": "600", "RAY_agent_register_timeout_ms": "600000",
+            "RAY_gcs_rpc_server_reconnect_timeout_s": "600",
             "RAY_memory_monitor_refresh_ms": "0",  # what other tests take is not for Ray to free
-            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **self.token,
+            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **QUICK_STARTS, **self.token,
         }  # fmt: skip
         self._server = subprocess.Popen(
-            [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            text=True, env=environment,
+            [sys.executable, "-c", SERVER, str(PATIENCE_SECONDS)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, text=True, env=environment,
         )  # fmt: skip
         self._raylets, self.names = dict[int, str](), list[str]()
         self.address = str(self._answer()["address"])

@@ -1,10 +1,15 @@
-"""What stands for the two agents of every Ray node, which serve dashboards and packages of environments: nothing here
-asks for either, and each takes half a second of processor time to start."""
+"""Ray's nodes without what nothing here asks for, and as slow to start as the machine makes them.
+
+The two agents of every node serve dashboards and packages of environments; each takes half a second of processor time
+to start.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 #: For the program of an agent, the names of the ports that a node waits for.
@@ -25,3 +30,20 @@ def stand_in_for_agents() -> None:
                 begun.rename(file)  # a node reads it as soon as it is there
             sys.stdin.read()
             os._exit(0)
+
+
+def wait_for_nodes(seconds: float) -> None:
+    """Let this process wait so long for a node that it starts: Ray itself waits for thirty seconds."""
+    from ray._private import services
+
+    get_node = services.get_node
+
+    def patient(*node: object) -> object:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            with suppress(RuntimeError):  # it has not registered yet
+                return get_node(*node)
+            time.sleep(0.1)
+        return get_node(*node)
+
+    services.get_node = patient
