@@ -31,7 +31,9 @@ from support.commands import PATIENCE_SECONDS, vdgs
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
+from vdgs.runs.visibility_store import with_fade
 from vdgs.viewer.server import ViewerServer
+from vdgs.visibility.visibility_counts import FADE_BELOW, count_visibility
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: A busy machine may need long; nothing waits so long where all is well.
@@ -52,7 +54,10 @@ def trained(folder: Path) -> Path:
 
 
 def expected(viewer: ViewerServer, camera: Camera) -> np.ndarray:
-    return to_8bit(render(viewer.scene.run.model, camera).image.numpy())
+    run = viewer.scene.run
+    cameras = [view.camera for view in run.capture.train_views]
+    shown = with_fade(run.model, count_visibility(run.model.anchors.positions, cameras), cameras, FADE_BELOW)
+    return to_8bit(render(shown, camera).image.numpy())
 
 
 class Guest:

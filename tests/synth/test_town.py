@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from dataclasses import replace
@@ -31,7 +32,9 @@ from vdgs.evaluation.renderable_model import RenderableModel
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.image_renderer import pixel_sample_offsets
+from vdgs.synth.image_renderer import pixel_sample_offsets, radiance
+from vdgs.synth.lighting import SkyMap
+from vdgs.synth.mesh import Material
 from vdgs.synth.moving_objects import make_moving_objects, place_moving_objects
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.streets import make_street_plan
@@ -55,7 +58,7 @@ def town() -> Town:
 def capture(town: Town, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("synth") / "capture"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vdgs.synth.generation.build_town", lambda seed, extent_m: town)
+        patch.setattr("vdgs.synth.generation.build_town", lambda seed, extent_m, pond_within: town)
         generate(folder, TINY)
     return folder
 
@@ -317,7 +320,7 @@ def test_plan_coordinates_invert() -> None:
 
 
 def test_every_seed_gives_a_town_of_its_own(town: Town, monkeypatch: pytest.MonkeyPatch) -> None:
-    towns = [town, build_town(1, TINY.extent_m)]
+    towns = [town, build_town(1, TINY.extent_m, pond_within=True)]
     assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
     for town in towns:
         square_meters = np.bincount(town.zones.cells.ravel(), minlength=len(LandUse)) * town.zones.cell**2
@@ -325,11 +328,27 @@ def test_every_seed_gives_a_town_of_its_own(town: Town, monkeypatch: pytest.Monk
         assert np.isfinite(town.mesh.vertices).all()
         assert np.isfinite(town.mesh.normals).all()
         assert town.mesh.faces.max() < len(town.mesh.vertices)
+    away = [np.hypot(each.terrain.ponds[0].x, each.terrain.ponds[0].y) for each in towns]
+    assert away[1] < 40 < away[0]  # metres; blocks are 42 apart
     tracer, things = RayTracer(towns[0].mesh), make_moving_objects(towns[0], 12, seed=0)
     monkeypatch.setattr("vdgs.synth.moving_objects.RayTracer", lambda mesh: tracer)  # takes long, and nobody asks it
     meshes = [place_moving_objects(towns[0], tracer, things, 0, photograph)[0].mesh for photograph in (3, 3, 4)]
     np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
     assert not np.array_equal(meshes[0].vertices, meshes[2].vertices)
+
+
+def test_waves_change_what_water_mirrors_and_nothing_else(town: Town) -> None:
+    pond, tracer = town.terrain.ponds[0], RayTracer(town.mesh)
+    x, y = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-2, 2, 40)] * 2))
+    origins = np.stack([pond.x + pond.rx * x, pond.y + pond.ry * y, np.full(1600, 60.0)], 1).astype(np.float32)
+    down = np.broadcast_to(np.float32([-0.2, -0.2, -0.96]), origins.shape)
+    sky = SkyMap(np.ones((8, 8), np.float32), 4.0, 1.0)
+    light = [radiance(replace(town, waves=at), tracer, sky, origins, down, 1e-3) for at in (None, (1, 2), (400, 9))]
+    water = town.mesh.material[light[0][1].triangle] == Material.WATER
+    assert 100 < water.sum() < 1500
+    for one, other in itertools.combinations([values for values, _ in light], 2):
+        assert np.array_equal(one[~water], other[~water])
+        assert (np.abs(one - other)[water].max(axis=1) > 0.01).mean() > 0.5
 
 
 @pytest.mark.parametrize("count", [1, 4, 7, 9])

@@ -46,8 +46,8 @@ def cloud(n: int, seed: int = 1) -> np.ndarray:
 @pytest.mark.parametrize("least", [1, 2, 4])
 def test_a_scene_fades_out_smoothly_beyond_what_enough_cameras_see(least: int) -> None:
     """Along a line outwards from a picture's edge, whose cameras all end there."""
-    camera = Camera(camera_from_world=look_down(np.array([0, 0, 8.0]), 0, 0), fx=600.0, fy=600.0, cx=320, cy=240, width=640,
-                    height=480)  # fmt: skip
+    pose = look_down(np.array([0, 0, 8.0]), 0, 0)
+    camera = Camera(camera_from_world=pose, fx=600.0, fy=600.0, cx=320, cy=240, width=640, height=480)
     cameras, edge = [camera] * 4, 32 / 60 * 8
     x = torch.linspace(0.5, 1.5, 400) * edge
     places = torch.stack([x, torch.zeros(400), torch.zeros(400)], dim=1)

@@ -6,8 +6,8 @@ truth/
   points.npz           true place of every sparse point, who truly sees it, whether it is an outlier
   views/NAME.npz       per test and validation photograph: depth, and V with occlusion, per pixel (uint16)
   depth/NAME.npz       depth of every training photograph, without what moves
-  masks/NAME.png       per training photograph, where things move (`--num-moving-objects`): black is what moves and its
-                       shadow, also without the other truth
+  masks/NAME.png       per training photograph, where things move (`--num-moving-objects`, `--moving-water`): black is
+                       what moves and its shadow, also without the other truth
 
 Views from where nobody flew (`captures.off_path`) have a folder of their own, with or without the other truth.
 """

@@ -52,7 +52,7 @@ COMMON_OPTIONS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 #: Options of a cluster, and others that few need: in the full help alone.
 RARE_OPTIONS = (
     "--address", "--cpus", "--mem-gb", "--gpus", "--min-visibility", "--antialiasing", "--num-off-path-images",
-    "--background",
+    "--background", "--moving-water",
 )  # fmt: skip
 
 #: The short help fits its explanations into a line of so many columns, and wraps them on narrower terminals.
