@@ -32,12 +32,12 @@ from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.viewer.layers import DisplayOptions, Painter
 from vdgs.viewer.live_run import open_run_or_checkpoint
 from vdgs.viewer.render_scheduler import RenderedFrame, RenderScheduler
-from vdgs.viewer.viewer_scene import REST_ERROR_PX, REST_MAX_COST, ViewerScene
+from vdgs.viewer.viewer_scene import PART_CACHE_BYTES, REST_ERROR_PX, REST_MAX_COST, ViewerScene
 
 #: A visitor moves so often a second.
 MOVES_PER_SECOND = 60
-#: Rows of full detail that are drawn at once, and samples of a pixel each way.
-STRIP_ROWS, SAMPLES = 16, 4
+#: Rows of full detail that are drawn at once.
+STRIP_ROWS = 16
 #: What is near enough to full detail, in dB.
 NEAR_DB = 35.0
 #: A visitor who moves on while a picture becomes better does so after so many seconds.
@@ -100,6 +100,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--samples", type=int, default=4, help="of a pixel each way, of the picture compared with")
     parser.add_argument("--flight", type=int, default=0, help="steps of a flight from over all into the street")
     parser.add_argument("--motion-only", action="store_true", help="compare with no full detail, which takes minutes")
     options = parser.parse_args()
@@ -113,14 +114,14 @@ def main() -> None:
     when, _ = visitor.wait(full=False)
     begun = time.time() - psutil.Process().create_time() - (time.monotonic() - when)
     print(f"first picture after {begun:.1f} s ({time.process_time():.1f} s of a processor); {memory()}", flush=True)
-    rested = dict[str, list[Picture]]()
+    rested = dict[str, np.ndarray]()
     for name, camera in places.items():
         fly(visitor, name, tree, camera, options.seconds)
         rested[name] = rest(visitor, name, camera)
     if options.flight:
         fly_down(tree, places, options.flight)
     for name, camera in () if options.motion_only else places.items():
-        compare(name, rested[name], tree, camera, scene.pixel_at_camera_height)
+        compare(name, rested[name] / 255.0, tree, camera, scene.pixel_at_camera_height, options.samples)
 
 
 def standpoints(tree: LodScene, width: int, height: int) -> dict[str, Camera]:
@@ -170,9 +171,9 @@ def moved(camera: Camera, share: float) -> Camera:
     return replace(camera, camera_from_world=pose)
 
 
-def rest(visitor: Visitor, name: str, camera: Camera) -> list[Picture]:
-    """The pictures of a camera at rest with their times, printed, and how soon one is there for who moves on before
-    the last of them."""
+def rest(visitor: Visitor, name: str, camera: Camera) -> np.ndarray:
+    """The first picture of a camera at rest. Print how near it and those that follow are to the last one, which is in
+    full detail, with their times, and how soon a picture is there for who moves on before that."""
     began, used, first = time.monotonic(), time.process_time(), len(visitor.frames)
     visitor.ask(camera)
     when, _ = visitor.wait(full=True)
@@ -182,17 +183,24 @@ def rest(visitor: Visitor, name: str, camera: Camera) -> list[Picture]:
     )
     visitor.whole()
     pictures = [Picture(at - began, cpu - used, each.image) for at, cpu, each in visitor.frames[first:] if each.is_full]
-    print(f"{name}: in full detail after {pictures[-1]}; {memory()}", flush=True)
+    course = [(each, psnr(each.image / 255.0, pictures[-1].image / 255.0)) for each in pictures]
+    near = next(each for each, found in course if found >= NEAR_DB)
+    print(
+        f"{name}: {course[0][1]:.1f} dB to full detail at first, {NEAR_DB:g} dB after {near}, all of it after "
+        f"{pictures[-1]}; {memory()}",
+        flush=True,
+    )
     waits = list[str]()
     for number, seconds in enumerate(INTERRUPT_SECONDS):
         visitor.ask(moved(camera, 0.001 * (number + 1)))
         visitor.wait(full=True)
         time.sleep(seconds)
-        began = time.monotonic()
+        began, used = time.monotonic(), time.process_time()
         visitor.ask(moved(camera, 0.001 * (number + 1.5)))
-        waits.append(f"{(visitor.wait(full=False)[0] - began) * 1000:.0f}")
+        waited = visitor.wait(full=False)[0] - began
+        waits.append(f"{waited * 1000:.0f} ({(time.process_time() - used) * 1000:.0f})")
     print(f"{name}: who moves on meanwhile gets a picture after {', '.join(waits)} ms; {memory()}", flush=True)
-    return pictures
+    return pictures[0].image
 
 
 def fly_down(tree: LodScene, places: dict[str, Camera], steps: int) -> None:
@@ -229,23 +237,15 @@ def draw_cut(scene: LodScene, camera: Camera, cut: LodCut) -> Raster:
     return render(replace(scene, tree=tree), camera)
 
 
-def compare(name: str, rested: list[Picture], tree: LodScene, camera: Camera, pixel: float) -> None:
+def compare(name: str, shown: np.ndarray, tree: LodScene, camera: Camera, pixel: float, samples: int) -> None:
     """Print what a picture at rest lacks."""
     at_rest = tree.at_error(REST_ERROR_PX).within(camera, REST_MAX_COST)
-    every = tree.at_error(0.0)
+    every = tree.in_detail(PART_CACHE_BYTES)
     exact, aliased = (full_detail(each, camera, 1) for each in (every.without_aliasing(pixel), every))
-    fine = full_detail(every, camera, SAMPLES)
-    shown = rested[0].image / 255.0
-    course = [(each, psnr(each.image / 255.0, exact)) for each in rested]
-    near = next((each for each, found in course if found >= NEAR_DB), None)
-    print(
-        f"{name}: {NEAR_DB:g} dB " + (f"after {near}" if near else "never") + ": ",
-        ", ".join(f"{each} {found:.1f} dB" for each, found in course),
-        flush=True,
-    )
+    fine = full_detail(every, camera, samples)
     print(
         f"{name}: {psnr(shown, exact):.1f} dB against full detail without aliasing, {psnr(shown, fine):.1f} dB against "
-        f"it with {SAMPLES**2} samples a pixel (full detail itself: {psnr(exact, fine):.1f} dB, with aliasing "
+        f"it with {samples**2} samples a pixel (full detail itself: {psnr(exact, fine):.1f} dB, with aliasing "
         f"{psnr(aliased, fine):.1f} dB); "
         f"{at_rest.max_error_px:.2f} px, cost {at_rest.cost(camera):,} of {tree.at_error(0.0).cost(camera):,}",
         flush=True,

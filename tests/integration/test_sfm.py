@@ -36,11 +36,13 @@ from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.report.write_report import write_report
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.sfm import feature_extraction, feature_matching, georegistration, incremental_mapper
+from vdgs.sfm import feature_extraction, feature_matching, georegistration, incremental_mapper, sfm_estimate
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, georegister, transform_model
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.reconstruction_plan import plan_reconstruction
+from vdgs.sfm.run_request import make_sfm_request
 from vdgs.sfm.workspace import call_cancellable
 from vdgs.system.atomic_files import write_json
 from vdgs.system.stop_signals import catch_stop_signals
@@ -292,15 +294,17 @@ def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, f
     assert "cut.jpg" in page
 
 
-def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path):
-    said = console()
-    estimate = estimate_run(replace(asked(flight, tmp_path / "run"), device="cpu"), said)
+def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path, monkeypatch):
+    request, said = replace(asked(flight, tmp_path / "run"), device="cpu"), console()
+    estimate = estimate_run(request, said)
     assert {"photographs", "coarse", "blocks", "measuring"} <= {
         name for name, cost in estimate.times.items() if cost.seconds > 0
     }
     assert "the whole job: about" in said.file.getvalue()
     assert "10 of 10" in said.file.getvalue()
     assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(sfm_estimate.feature_matching, "count_inliers", lambda workspace: [])  # three far apart
+    assert sfm_estimate.estimate_sfm(plan_reconstruction(make_sfm_request(request))).points > 100
 
 
 def test_a_run_among_other_files_is_refused_before_the_work(flight, tmp_path):

@@ -95,13 +95,13 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
     painter, plain = Painter(seen), DisplayOptions(min_visibility=0)
     exact = painter.paint(plain, camera, camera, full_detail=True)
     assert np.array_equal(exact, shown(scene, model, camera))
-    monkeypatch.setattr(viewer_scene, "PART_MAX_ANCHORS", 300)
-    parts = painter.parts_in_detail(plain, camera)
+    monkeypatch.setattr(viewer_scene, "PART_MAX_ANCHORS", 100)
+    parts, kept = painter.parts_in_detail(plain, camera), tree.tree.cached_bytes
     assert len(parts) > 4
-    assert np.array_equal(draw_parts(painter, plain, camera, parts), exact)  # the parts are all of it, each once
-    both = DisplayOptions(model="both", split=0.4)
-    whole = painter.paint(both, camera, camera, full_detail=True)
-    assert np.array_equal(draw_parts(painter, both, camera, parts), whole)
+    for display in (plain, DisplayOptions(model="both", split=0.4), DisplayOptions(mark_trust=True, min_visibility=3)):
+        exact = painter.paint(display, camera, camera, full_detail=True)
+        assert np.array_equal(draw_parts(painter, display, camera, parts), exact)  # the parts are all of it, each once
+    assert tree.tree.cached_bytes == kept  # what pictures of a moving camera need stays in memory
     near = pick_position(seen.shown("merged"), camera, 32.5, 20.5)
     assert near is not None
     assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -16,7 +17,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.gaussians import Gaussians, project_splats
 from vdgs.model.lod_tree import LodCut, LodTree
-from vdgs.model.renderer import compensated_splats, view_splats, without_aliasing
+from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
@@ -39,6 +40,9 @@ class LodScene:
     pixel: float | None = None
     #: What opacities are multiplied with, asked for as by `values`; None: nothing.
     fade: Callable[[NodeContent, Tensor], Tensor] | None = None
+    #: Of a leaf only those anchors are put together that a view may show, and they alone are places: most of a leaf is
+    #: beside a small part of a view.
+    culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
     _gaussians: dict[tuple[int, ...], Gaussians | None] = field(default_factory=dict)
 
@@ -63,15 +67,10 @@ class LodScene:
         return self.at_error(self.tree.error_within(camera, self.max_error_px, max_cost))
 
     def in_detail(self, cache_bytes: int) -> LodScene:
-        """The same scene drawn from all anchors, with memory of its own: what this one keeps stays there."""
+        """The same scene drawn from all anchors, for small parts of views, with memory of its own: what this one keeps
+        stays there."""
         tree = self.tree.with_own_cache(cache_bytes)
-        return replace(self, tree=tree, max_error_px=0.0, view=None, _anchors={}, _gaussians={})
-
-    def parts_in_detail(self, camera: Camera, max_anchors: int, min_px: int) -> list[Camera]:
-        """The parts of a view in which it is drawn from all anchors (`LodTree.parts_in_detail`)."""
-        seen = replace(camera, photograph_pixel=self.model.photograph_pixel)
-        parts = self.tree.parts_in_detail(seen, max_anchors, min_px)
-        return [replace(part, photograph_pixel=camera.photograph_pixel) for part in parts]
+        return replace(self, tree=tree, max_error_px=0.0, view=None, culls_leaves=True, _anchors={}, _gaussians={})
 
     def for_view(self, view: Camera) -> LodScene:
         """The same scene for pictures of parts of a view, one after another."""
@@ -94,7 +93,8 @@ class LodScene:
         """The splats of a view, and to which of `places` each belongs."""
         cut = self._cut(camera)
         shown, sources, first = list[Splats](), list[Tensor](), 0
-        anchors = _held(self._anchors, cut.leaves, self._assemble_anchors)
+        assemble = partial(self._assemble_anchors, camera=camera)
+        anchors = assemble(cut.leaves) if self.culls_leaves else _held(self._anchors, cut.leaves, assemble)
         if anchors is not None:
             drawn = anchors if self.pixel is None else without_aliasing(anchors, self.pixel)
             rows, splats = view_splats(drawn, camera, image_index)
@@ -118,20 +118,34 @@ class LodScene:
         """A value for each of the places that a view is drawn from, anchors and then centers of merged Gaussians:
         `of` gives those of the places of a node, or of the anchors of a leaf."""
         cut, found = self._cut(camera), list[Tensor]()
-        for nodes, each in ((cut.leaves, self._leaf_values), (cut.nodes, self._node_values)):
-            if nodes:
-                values, drawn = each(nodes, of), None if self.fade is None else each(nodes, self.fade) > 0
-                found.append(values if drawn is None else values[drawn])
+        if cut.leaves:
+            found.append(self._leaf_values(cut.leaves, camera, of))
+        if cut.nodes:
+            values = self._node_values(cut.nodes, of)
+            found.append(values if self.fade is None else values[self._node_values(cut.nodes, self.fade) > 0])
         return torch.cat(found) if found else torch.zeros(0)
 
-    def _leaf_values(self, leaves: tuple[int, ...], of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
-        """Values of the anchors of some leaves in the order of the model."""
+    def _leaf_values(
+        self, leaves: tuple[int, ...], camera: Camera, of: Callable[[NodeContent, Tensor], Tensor]
+    ) -> Tensor:
+        """Values of the anchors of some leaves that are drawn in a view, in the order of the model."""
         rows, found = list[Tensor](), list[Tensor]()
         for leaf in leaves:
             anchors, these = self.tree.anchors(leaf)
-            rows.append(these)
-            found.append(of(("anchors", leaf), anchors.positions))
+            values, mask = of(("anchors", leaf), anchors.positions), self._leaf_mask(leaf, camera)
+            rows.append(these if mask is None else these[mask])
+            found.append(values if mask is None else values[mask])
         return torch.cat(found)[torch.cat(rows).argsort()]
+
+    def _leaf_mask(self, leaf: int, camera: Camera) -> Tensor | None:
+        """Which anchors of a leaf are put together for a view; None: all."""
+        anchors, _ = self.tree.anchors(leaf)
+        mask = None if self.fade is None else self.fade(("anchors", leaf), anchors.positions) > 0
+        if self.culls_leaves:
+            seen = torch.zeros(len(anchors), dtype=torch.bool)
+            seen[cull_anchors(anchors, replace(camera, photograph_pixel=self.model.photograph_pixel))] = True
+            mask = seen if mask is None else mask & seen
+        return mask
 
     def _node_values(self, nodes: tuple[int, ...], of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
         """Values of the merged Gaussians of some nodes."""
@@ -145,17 +159,15 @@ class LodScene:
         seen = replace(camera, photograph_pixel=self.model.photograph_pixel)
         return self.tree.cut(seen, self.max_error_px)
 
-    def _assemble_anchors(self, leaves: tuple[int, ...]) -> AnchorModel | None:
+    def _assemble_anchors(self, leaves: tuple[int, ...], camera: Camera) -> AnchorModel | None:
         """The anchors of some leaves that are drawn, in the order of the model, each with its decoder."""
-        found = self.tree.anchors_of(leaves)
+        found = self.tree.anchors_of(leaves, lambda leaf: self._leaf_mask(leaf, camera))
         if found is None:
             return None
         anchors, rows = found
         if self.fade is not None:
-            factors = self._leaf_values(leaves, self.fade)
-            drawn = factors > 0
-            anchors = replace(anchors.select(drawn), opacity_factors=factors[drawn].to(anchors.positions))
-            rows = rows[drawn]
+            factors = self._leaf_values(leaves, camera, self.fade)
+            anchors = replace(anchors, opacity_factors=factors.to(anchors.positions))
         return model_of_rows(self.model, anchors, rows).to(self.device)
 
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> Gaussians | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass
 from functools import reduce
@@ -33,6 +33,8 @@ CACHE_BYTES = 384 << 20
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.
 ANCHOR_COST = 8
+#: Parts of a view in full detail: places of a leaf's box each way, pixels that count as an anchor, the least size.
+BOX_SAMPLES, PART_PIXELS, MIN_PART_PX = 4, 25, 16
 
 _Content = TypeVar("_Content")
 
@@ -129,21 +131,17 @@ class LodTree:
         over = np.flatnonzero((costs > max_cost) & visible[order])
         return max(least_px, float(errors[order[over[0]]])) if len(over) else least_px
 
-    def parts_in_detail(self, camera: Camera, max_anchors: int, min_px: int) -> list[Camera]:
-        """The parts of a view in which it is drawn from all anchors, from its middle on: in halves until the leaves
-        of each hold at most so many, or it is at most so many pixels wide and high."""
-        rest, found = [(0, 0, camera.width, camera.height)], list[Camera]()
-        while rest:
-            left, top, right, bottom = rest.pop()
-            part = camera.cropped(left, top, right, bottom)
-            if max(part.width, part.height) <= min_px or self.table.anchors[self.visible(part)].sum() <= max_anchors:
-                found.append(part)
-            elif part.width >= part.height:
-                middle = (left + right) // 2
-                rest += [(left, top, middle, bottom), (middle, top, right, bottom)]
-            else:
-                middle = (top + bottom) // 2
-                rest += [(left, top, right, middle), (left, middle, right, bottom)]
+    def parts_in_detail(self, camera: Camera, max_anchors: int) -> list[Camera]:
+        """The parts of a view in which it is drawn from all anchors, from its middle on: in halves until each shows at
+        most so many anchors, by where the boxes of the leaves lie, `PART_PIXELS` pixels counted as one."""
+        low, high = np.split(self.table.bounds[self._is_leaf].astype(np.float64)[:, None], 2, axis=2)
+        steps = (np.arange(BOX_SAMPLES) + 0.5) / BOX_SAMPLES
+        shares = np.stack([*np.meshgrid(steps, steps), np.full((BOX_SAMPLES, BOX_SAMPLES), 0.5)], -1).reshape(-1, 3)
+        pixels, depths = camera.project((low + shares * (high - low)).reshape(-1, 3))
+        anchors = np.repeat(self.table.anchors[self._is_leaf] / len(shares), len(shares))
+        in_front = depths > NEAR_PLANE
+        parts = _halve((0, 0, camera.width, camera.height), pixels[in_front], anchors[in_front], max_anchors)
+        found = [camera.cropped(*box) for box in parts]
         return sorted(found, key=lambda part: np.hypot(part.cx - part.width / 2, part.cy - part.height / 2))
 
     def with_own_cache(self, cache_bytes: int) -> LodTree:
@@ -167,13 +165,40 @@ class LodTree:
         parts = [self.gaussians(node) for node in nodes]
         return _joined(Gaussians, parts) if parts else None
 
-    def anchors_of(self, leaves: tuple[int, ...]) -> tuple[Anchors, Tensor] | None:
-        """The anchors of some leaves in the order of the model, and their rows there."""
+    def anchors_of(
+        self, leaves: tuple[int, ...], mask_of: Callable[[int], Tensor | None]
+    ) -> tuple[Anchors, Tensor] | None:
+        """The anchors of some leaves in the order of the model, and their rows there; of each those in its mask."""
         parts = [self.anchors(leaf) for leaf in leaves]
+        masks = [mask_of(leaf) for leaf in leaves]
+        parts = [
+            (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
+            for (anchors, rows), mask in zip(parts, masks, strict=True)
+        ]
         if not parts:
             return None
         rows, order = torch.cat([rows for _, rows in parts]).sort()
         return _joined(Anchors, [anchors for anchors, _ in parts]).select(order), rows
+
+
+def _halve(
+    box: tuple[int, int, int, int], pixels: Float[np.ndarray, "p 2"], weights: Float[np.ndarray, " p"], most: float
+) -> Iterator[tuple[int, int, int, int]]:
+    """The parts (left, top, right, bottom) of a box of pixels in which places weigh at most so much."""
+    left, top, right, bottom = box
+    width, height = right - left, bottom - top
+    inside = ((pixels >= (left, top)) & (pixels < (right, bottom))).all(1)
+    pixels, weights = pixels[inside], weights[inside]
+    if max(width, height) <= MIN_PART_PX or weights.sum() + width * height / PART_PIXELS <= most:
+        yield box
+        return
+    x, y = (left + right) // 2, (top + bottom) // 2
+    halves = (
+        [(left, top, x, bottom), (x, top, right, bottom)] if width >= height
+        else [(left, top, right, y), (left, y, right, bottom)]
+    )  # fmt: skip
+    for half in halves:
+        yield from _halve(half, pixels, weights, most)
 
 
 def _levels(parent: Int[np.ndarray, " t"]) -> list[Int[np.ndarray, " n"]]:

@@ -27,6 +27,9 @@ MAPPING_SCALE, PARALLEL_MAPPING = 16, 0.3
 #: the photographs that observe a point, for the root of those that show its place; and where positions do not tell
 #: these. Measured: 70, 61 and 19 % of the features where a pair matches 20, 18 and 4 %; 4.6 and 2.3 of 17 and 4.5.
 INDEPENDENT_PAIRS, TRACK_LENGTH, TYPICAL_VIEWS = 5, 1.1, 8.0
+#: Features that a pair matches where those that were tried match none, as a share (the least that was measured, above);
+#: and points that a photograph brings at least, so that there is a scene to time.
+LEAST_MATCHED, LEAST_POINTS = 0.04, 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,13 +79,13 @@ def estimate_sfm(plan: ReconstructionPlan) -> SfmEstimate:
             inliers = sum(feature_matching.count_inliers(workspace)) / (4 * (len(names) - 1))
     feature = searched.cost_since(before).processor_seconds / len(chosen)
     features = sum(counts.values()) / max(1, len(counts))
-    share = min(1.0, inliers / max(1.0, features))
+    share = min(1.0, inliers / max(1.0, features)) or LEAST_MATCHED  # flights overlap little: a far pair may not
     observations = len(photographs) * features * (1 - (1 - share) ** INDEPENDENT_PAIRS)
     track = max(2.0, TRACK_LENGTH * (plan.preflight.views_per_point or TYPICAL_VIEWS) ** 0.5)
     return SfmEstimate(
         steps=_steps(plan, feature, matching, observations),
         slowdown=searched.slowdown_since(before, together),
-        points=round(observations / track),
+        points=max(round(observations / track), LEAST_POINTS * len(photographs)),
         probed=tuple(names),
     )
 

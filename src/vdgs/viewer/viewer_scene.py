@@ -35,9 +35,9 @@ ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
 #: (choice: below it, at most a second on two cores).
 REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 2_000_000
-#: A view at rest is then drawn from all anchors, in parts whose leaves hold at most so many or which are so small, in
-#: pixels: a part takes about 50 ms on two cores (measured). Leaves take so much memory meanwhile.
-PART_MAX_ANCHORS, PART_MIN_PX, PART_CACHE_BYTES = 40_000, 16, 64 << 20
+#: A view at rest is then drawn from all anchors, in parts that show about so many: a part takes about 50 ms on two
+#: cores (measured). Leaves take so much memory meanwhile.
+PART_MAX_ANCHORS, PART_CACHE_BYTES = 20_000, 256 << 20
 #: Photographs kept in memory, decoded (choice).
 _IMAGE_CACHE_BYTES = 128 << 20
 #: What a camera meters is drawn from at most about so many anchors (choice): fitting its law takes up to two hundred
@@ -121,7 +121,7 @@ class ViewerScene:
         """The parts of a view that make it whole where `get_level` draws it coarser than the model is, from its middle
         on; none for a model without a tree."""
         tree = self._faded_tree(name, min_visibility)
-        return [] if tree is None else tree.parts_in_detail(camera, PART_MAX_ANCHORS, PART_MIN_PX)
+        return [] if tree is None else tree.tree.parts_in_detail(camera, PART_MAX_ANCHORS)
 
     def _detailed(self, name: str, min_visibility: int, tree: LodScene) -> LodScene:
         """A tree that draws all anchors."""
