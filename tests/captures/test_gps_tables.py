@@ -58,6 +58,7 @@ TABLES = {
     "excel": "sep=;\nname;lat;lon;alt\na.jpg;-33.5;-70.6;500\n",
     "rows without a position": "SourceFile\tGPSLatitude\tGPSLongitude\tGPSAltitude\nb.jpg\t-\t-\t-\n"
     "c.jpg\tNaN\tnan\tnan\na.jpg\t-33.5\t-70.6\t500\n",
+    "over the sea": "name,lat,lon,alt\na.jpg,-33.5,-70.6,500 m AMSL\n",
     "heights over the ground": "name,lat,lon,height,altitude\na.jpg,-33.5,-70.6,50,500\n",
     "alturas": "Nombre,Latitud,Longitud,Altura,Altitud\na.jpg,-33.5,-70.6,50,500\n",
     "german": "Dateiname;Breitengrad;Längengrad (°);Höhe [m]\na.jpg;-33,5;-70,6;500,0\n",
@@ -155,8 +156,15 @@ def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
     file = tmp_path / "gps.csv"
     file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,-33.5{k},-70.6,\n" for k in range(4)))
     assert all(math.isnan(row.position[2]) for row in read_gps_table(file).rows)
+    rasters = tmp_path / "rasters.csv"
+    rasters.write_text(file.read_text().replace("-70.6,", "-70.6,-9999"))
+    assert all(math.isnan(row.position[2]) for row in read_gps_table(rasters).rows)
     found = read_gps_priors(seen, file, (1.0, 2.0))
     assert len(found) == 4
+    for latitude, says in ((-33.5, False), (-34.5, True)):
+        placed = [replace(photo, lat_lon=(latitude, -70.6)) for photo in seen]
+        notes = read_gps_priors(placed, rasters, (1.0, 2.0)).notes
+        assert any("rasters.csv: its positions lie 109 km from those in" in note for note in notes) is says
     assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.6)
     assert any("gives no altitude for 0.jpg" in note for note in found.notes)
 

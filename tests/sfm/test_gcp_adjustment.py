@@ -163,6 +163,16 @@ def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
     assert places[0] == pytest.approx(places[1], abs=1e-6)
 
 
+def test_heights_that_are_not_known_are_told_from_zeros(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    rows = [line.split() for line in listed(flight).splitlines()]
+    for z, said in (("0", "exactly 0"), ("-9999", "without a height (a, b, c)"), ("NaN", "without a height (a, b, c)")):
+        file.write_text("\n".join(" ".join([*row[:2], z, *row[3:]] if row[1:] else row) for row in rows))
+        found = read_gcp_list(file, collection, ())
+        assert said in "".join(found.notes)
+        assert found.has_heights is (z == "0")
+
+
 BAD = {
     "nothing": ("", "is empty"),
     "no system": (None, "must name the coordinate system"),
@@ -291,6 +301,32 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     assert rows["Check points"].startswith("2, held out: RMSE 0.")
     assert [row[0] for row in gcp_table(facts)] == list(NAMES)
     assert read_reconstruction(tmp_path / "capture") == facts
+
+
+def test_control_points_without_heights_count_in_the_plane(made, flight, points, tmp_path):
+    """Of some points; of all, whose model then lies as high as GPS says, upright by the attitudes."""
+    file = write_list(tmp_path / "gcp_list.txt", flight, points)
+    text = file.read_text()
+    rows = [line.split() for line in text.splitlines()[3:]]
+    for flat in (NAMES[4:], NAMES):
+        words = [[*row[:2], "nan" if row[6] in flat else row[2], *row[3:]] for row in rows]
+        file.write_text("\n".join(["EPSG:32719", *(" ".join(each) for each in words)]))
+        facts, capture, said = surveyed(made, flight, tmp_path, file, "well")
+        off = {each.name: each.residual_m for each in facts.survey}
+        assert [len(off[name]) for name in NAMES] == [2 if name in flat else 3 for name in NAMES]
+        assert np.abs([value[:2] for value in off.values()]).max() < 0.3
+        assert "points without a height (" in said
+        assert dict(report_rows(facts))["Check points"].endswith("m north")
+        shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]
+        heights = [view.camera.position[2] + shift[2] for view in capture.views]
+        up = np.median(np.subtract(heights, [camera.position[2] for camera in flight.cameras]))
+        if flat == NAMES:
+            assert up == pytest.approx(0, abs=3)  # GPS, straight down from one height
+            assert "heights are by GPS" in said
+            assert len(facts.accuracy.place_m) == 2
+        else:
+            assert up == pytest.approx(SURVEY_OFF[2], abs=0.5)
+            assert "too few control points" not in said
 
 
 def test_check_points_measure_a_model_that_gps_placed(made, flight, points, tmp_path):

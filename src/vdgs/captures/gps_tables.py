@@ -24,7 +24,7 @@ from vdgs.captures.coordinate_systems import (
     names_a_system,
     to_geodetic,
 )
-from vdgs.captures.table_columns import ANGLES, RADIANS, known_columns, meters_of, number_of
+from vdgs.captures.table_columns import ANGLES, NO_DATA, RADIANS, UNKNOWN, known_columns, meters_of, number_of
 from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
 from vdgs.errors import CaptureError
 
@@ -45,10 +45,9 @@ _OTHERS = (
     ),
 )
 _DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
-#: What programs write where they know nothing.
-_UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
+_DATUM = re.compile(r"sea|\b(?:a?m?sl|hae|ellipsoid(?:al)?|wgs ?84)\b", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
 #: Degrees and minutes in one number, of which programs may have cut the zeros before the other angle of the row.
 _NMEA = re.compile(r"\d{4,5}\.\d+")
@@ -230,7 +229,7 @@ def _word(row: Row, columns: _Columns, what: str) -> str:
 
 def _has_place(row: Row, columns: _Columns) -> bool:
     both = ("x", "y") if "x" in columns.where and columns.system is not None else ("lat", "lon")
-    return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in _UNKNOWN for what in both)
+    return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in UNKNOWN for what in both)
 
 
 def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
@@ -279,14 +278,16 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str) ->
 
 def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     word = _word(row, columns, "alt")
-    if word.lower() in _UNKNOWN:
+    if word.lower() in UNKNOWN:
         return math.nan
     word = re.sub(r"[.,](?=.*[.,])", "", word) if math.isfinite(number_of(word)) else word  # thousands
     number = _LEADING_NUMBER.match(word)
     unit = meters_of(word)
-    if number is None or (word[number.end() :].strip() and "sea" not in word.lower() and unit == 1):
+    if number is None or (word[number.end() :].strip() and not _DATUM.search(word) and unit == 1):
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
     value = float(number[1].replace(",", ".")) * (unit if unit != 1 else columns.altitude_unit)
+    if value in NO_DATA:
+        return math.nan
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 

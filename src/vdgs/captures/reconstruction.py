@@ -60,7 +60,7 @@ class GcpReport:
     photographs: int
     """Placed photographs that show it; 0: too few to tell its place."""
     residual_m: tuple[float, ...] | None = None
-    """Seen minus surveyed: east, north, up."""
+    """Seen minus surveyed: east, north and, where that was surveyed, up."""
     error_px: float | None = None
     """RMS distance from where photographs show it to where the model puts it there."""
 
@@ -140,13 +140,12 @@ class ReconstructionReport:
     flown: tuple[str, ...] = ()
     """When the first and the last photograph were taken, as EXIF has it; empty where it says nothing."""
 
-    def gcp_rmse_m(self, used_as: str) -> tuple[float, float, float] | None:
-        """East, north and up of check points, or of control points; None where there are none."""
+    def gcp_rmse_m(self, used_as: str) -> tuple[float, ...] | None:
+        """East, north and, of those with heights, up of check points, or of control points; None where there are
+        none."""
         known = [each.residual_m for each in self.survey if each.role == used_as and each.residual_m]
-        if not known:
-            return None
-        east, north, up = (math.sqrt(sum(value**2 for value in axis) / len(known)) for axis in zip(*known, strict=True))
-        return east, north, up
+        axes = [[off[axis] for off in known if axis < len(off)] for axis in range(3)]
+        return tuple(math.sqrt(sum(value**2 for value in axis) / len(axis)) for axis in axes if axis) or None
 
 
 def is_reconstruction(root: Path) -> bool:
@@ -250,9 +249,9 @@ def _survey_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
     ):
         rmse = metadata.gcp_rmse_m(used_as)
         if rmse is not None:
-            east, north, up = rmse
             count = sum(each.role == used_as and each.residual_m is not None for each in metadata.survey)
-            rows.append((label, f"{count}, {what}: RMSE {east:.3f} m east, {north:.3f} m north, {up:.3f} m up"))
+            axes = ", ".join(f"{v:.3f} m {axis}" for v, axis in zip(rmse, ("east", "north", "up"), strict=False))
+            rows.append((label, f"{count}, {what}: RMSE {axes}"))
     return rows
 
 
@@ -260,7 +259,8 @@ def gcp_table(metadata: ReconstructionReport) -> list[tuple[str, str, str, str, 
     """Surveyed points as rows of words: name, what for, photographs, east, north, up in metres, pixels."""
     rows = []
     for each in metadata.survey:
-        off = [f"{value:+.3f}" for value in each.residual_m] if each.residual_m else ["–"] * 3
+        known = each.residual_m or ()
+        off = [f"{value:+.3f}" for value in known] + ["–"] * (3 - len(known))
         pixels = f"{each.error_px:.1f}" if each.error_px is not None else "–"
         rows.append((each.name, each.role, str(each.photographs), *off, pixels))
     return rows  # type: ignore[return-value]

@@ -63,6 +63,12 @@ _PARTS = re.compile(r"[\[( _](mm|cm|km)\b", re.IGNORECASE)
 ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
 RADIANS = re.compile(r"[\[( _]rad(?:ians)?\b", re.IGNORECASE)
 
+#: What programs write where they know nothing.
+UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
+
+#: And what programs for rasters write then.
+NO_DATA = frozenset({-9999.0, -99999.0, -32767.0, -32768.0})
+
 
 def known_columns(words: Sequence[str]) -> dict[str, int]:
     """Which of these names of columns is what."""

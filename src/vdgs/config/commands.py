@@ -44,7 +44,8 @@ class ComputeOptions:
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it; cuda:0 is
+    that card alone."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,10 @@ from jaxtyping import Float
 from scipy.special import stdtrit
 
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, intersect_rays
+from vdgs.captures.plane_fit import fit_plane, in_plane
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.errors import CaptureError
-from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear
+from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear, rotation_to_z
 from vdgs.sfm.bending import bend_to_points
 from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georegistration import transform_model
@@ -45,6 +46,18 @@ class TriangulatedPoint:
     kept_px: float
     """The same of the marks that agree."""
     agreeing: tuple[GcpObservation, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Level:
+    """What says how a model lies where too few points have heights."""
+
+    up: Float[np.ndarray, "3"]
+    deviation_deg: float
+    gps: Similarity | None
+    """From the model to metres by positions."""
+    gps_up_m: float | None
+    """How good heights are by that (95 %)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +159,12 @@ def adjust_to_gcps(
     origin: tuple[float, float, float],
     fix_focal: bool,
     threads: int,
+    level: Level,
     doubts: Callable[[Similarity, np.ndarray, np.ndarray], str] | None,
 ) -> Surveyed:
     """Move a model, in place, to the points that are not held out, metres east, north, up of `origin`; then a copy is
-    bent by them: a bundle adjustment in which they stay where they were surveyed.
+    bent by those with heights: a bundle adjustment in which they stay where they were surveyed. Points without heights
+    have those that the model gives them, levelled by the points with heights or else by `level`.
 
     `doubts` says of a similarity, of where the model has the points and of where they were surveyed, what speaks
     against it. Raises CaptureError for what it says, where marks fit nothing, and where fewer than three of the points
@@ -170,7 +185,7 @@ def adjust_to_gcps(
             f"there. Are they pixels of photographs of another size, or of other points? {ANYWAY_GCP}"
         )
     rows = np.array([k for k, _ in used], int)
-    if len(used) < MIN_CONTROL_POINTS or is_collinear(targets[rows]):
+    if len(used) < MIN_CONTROL_POINTS or is_collinear(np.nan_to_num(targets[rows])):
         bad = f", {len(wrong)} more are marked where they cannot be" if wrong else ""
         raise CaptureError(
             f"{gcps.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
@@ -178,14 +193,25 @@ def adjust_to_gcps(
             "out: --check-points all"
         )
     places = np.array([seen.position for _, seen in used])
-    similarity, trusted = _fit_to_gcps(places, targets[rows])
-    said = doubts(similarity, places[trusted], targets[rows[trusted]]) if doubts is not None else ""
+    known = np.isfinite(targets[rows, 2])
+    is_level = is_collinear(places[known])  # too few heights
+    aims = _with_heights(places, targets[rows], is_level, level)
+    similarity, trusted = _fit_to_gcps(places, aims)
+    said = doubts(similarity, places[trusted], aims[trusted]) if doubts is not None else ""
     if said:
         raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
     transform_model(model, similarity)
-    accuracy = _accuracy(similarity.apply(places[trusted]), targets[rows[trusted]])
-    kept = rows[trusted].tolist()
-    model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in kept], fix_focal, threads)
+    accuracy = _accuracy(similarity.apply(places[trusted]), aims[trusted], int(known[trusted].sum()))
+    notes: tuple[str, ...] = ()
+    kept, firm = rows[trusted].tolist(), rows[trusted & known].tolist()
+    if is_level:
+        across = accuracy.place_m[:1] if accuracy.place_m else ()
+        up_m = () if level.gps_up_m is None or known.any() else (level.gps_up_m,)
+        accuracy = replace(accuracy, place_m=(*across, *up_m), level_deg=2 * level.deviation_deg)
+        by = "points with heights" if known.any() else "GPS" if level.gps is not None else "nothing"
+        notes = (f"too few control points have heights to level or to bend the model: heights are by {by}.",)
+    else:
+        model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in firm], fix_focal, threads)
     doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
     return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
 
@@ -240,11 +266,32 @@ def _other_marks(model: pycolmap.Reconstruction, control: GcpList) -> str:
     return ""
 
 
-def _accuracy(placed: np.ndarray, targets: np.ndarray) -> AccuracyFacts:
-    """What 95 % stay below, from what a similarity to the points leaves."""
+def _with_heights(
+    places: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], is_level: bool, level: Level
+) -> Float[np.ndarray, "n 3"]:
+    """Targets of which those without a height have the model's: levelled by those with heights, or else by `level`."""
+    known = np.isfinite(targets[:, 2])
+    if known.all():
+        return targets
+    if is_level:
+        upright = places @ rotation_to_z(level.up).T
+        heights = abs(fit_plane(in_plane(upright), in_plane(targets))[0]) * upright[:, 2]
+        if known.any():
+            heights += np.median(targets[known, 2] - heights[known])
+        elif level.gps is not None:
+            heights += np.median(level.gps.apply(places)[:, 2] - heights)
+    else:
+        heights = fit_similarity(places[known], targets[known]).apply(places)[:, 2]
+    measured = targets if not is_level else np.full_like(targets, np.nan)  # all heights there are by one plane
+    return np.column_stack([targets[:, :2], np.where(np.isfinite(measured[:, 2]), targets[:, 2], heights)])
+
+
+def _accuracy(placed: np.ndarray, targets: np.ndarray, heights: int) -> AccuracyFacts:
+    """What 95 % stay below, from what a similarity to the points leaves, of which so many have measured heights."""
     off, count = placed - targets, len(targets)
-    times = float(stdtrit(max(1, 3 * count - 7), 0.975))
-    deviation = float(np.sqrt((off**2).sum() / max(1, 3 * count - 7)))
+    free = max(1, 2 * count + heights - (7 if heights >= MIN_CONTROL_POINTS else 4))
+    times = float(stdtrit(free, 0.975))
+    deviation = float(np.sqrt((off**2).sum() / free))
     spread = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)
     scale = times * deviation / float(np.sqrt((spread**2).sum()))
     across = float(np.hypot(spread[0], spread[1]))
@@ -272,7 +319,7 @@ def measure_gcps(
         if seen is None:
             facts.append(GcpReport(point.name, used_as, 0))
         else:
-            off = tuple(float(value) for value in seen.position - targets[k])
+            off = tuple(float(value) for value in seen.position - targets[k] if np.isfinite(value))
             facts.append(GcpReport(point.name, used_as, seen.num_images, off, seen.error_px))
     return tuple(facts)
 

@@ -14,13 +14,14 @@ from jaxtyping import Float
 from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, in_units_of, to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
-from vdgs.captures.table_columns import known_columns, meters_of, number_of
+from vdgs.captures.table_columns import NO_DATA, UNKNOWN, known_columns, meters_of, number_of
 from vdgs.captures.text_tables import Line, Row, rows_of, separator_of
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.system.units import first_names
 
 #: Fewer points fix no place, scale and directions.
 MIN_CONTROL_POINTS = 3
@@ -50,7 +51,7 @@ class GroundControlPoint:
 
     name: str
     geodetic: tuple[float, float, float]
-    """Latitude and longitude (WGS 84) in degrees, height in metres as the file has it."""
+    """Latitude and longitude (WGS 84) in degrees, height in metres as the file has it; NaN where it says none."""
     observations: tuple[GcpObservation, ...]
     is_check_point: bool
     """Only measured afterwards (a check point)."""
@@ -70,14 +71,26 @@ class GcpList:
     def has_control_points(self) -> bool:
         return any(not point.is_check_point for point in self.points)
 
+    @property
+    def has_heights(self) -> bool:
+        """Whether control points say how high the place is."""
+        return any(not point.is_check_point and math.isfinite(point.geodetic[2]) for point in self.points)
+
     def enu(self, origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
-        """All points in metres east, north, up of an origin."""
-        return enu_from_geodetic(np.array([point.geodetic for point in self.points]), origin)
+        """All points in metres east, north, up of an origin; up is NaN of points without a height."""
+        geodetic = np.array([point.geodetic for point in self.points])
+        flat = np.isnan(geodetic[:, 2])
+        enu = enu_from_geodetic(np.where(flat[:, None] & [False, False, True], origin[2], geodetic), origin)
+        enu[flat, 2] = np.nan
+        return enu
 
     @property
     def median_origin(self) -> tuple[float, float, float]:
         """An origin, where positions give none."""
-        return median_place(np.array([point.geodetic for point in self.points]))
+        geodetic = np.array([point.geodetic for point in self.points])
+        heights = geodetic[np.isfinite(geodetic[:, 2]), 2]
+        latitude, longitude, _ = median_place(geodetic)
+        return latitude, longitude, float(np.median(heights)) if len(heights) else 0.0
 
 
 @dataclass(frozen=True)
@@ -117,6 +130,12 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
         seen = tuple(sighting for _, sighting in group if sighting is not None)
         held_out = ALL_POINTS in check_points or name in check_points or name.startswith(CHECK_PREFIX)
         points.append(GroundControlPoint(name, geodetic, seen, held_out))
+    flat = [point.name for point in points if math.isnan(point.geodetic[2])]
+    if flat:
+        strange = [*strange, f"{file.name}: points without a height ({first_names(flat)}): used in the plane."]
+    if len(points) >= MIN_CONTROL_POINTS and not any(line.place[2] for line in lines):
+        said = "all heights are exactly 0 and are used as they are. Where they are not known, write nan."
+        strange = [*strange, f"{file.name}: {said}"]
     if any(name.startswith(CHECK_PREFIX) for name in names):
         strange = [*strange, f"{file.name}: points named {CHECK_PREFIX}... are held out as check points, as in ODM."]
     return _checked(points, system, file, strange)
@@ -152,13 +171,15 @@ def _geodetic(lines: Sequence[_Line], name: str, transform: Any, system: str, fi
         raise CaptureError(
             f"{file}: line {other.number}: the point {name} has another place in line {first.number}. Mend one of them."
         )
-    latitude, longitude, height = (float(value) for value in transform(np.array([first.place]))[0])
+    flat = math.isnan(first.place[2])
+    place = np.nan_to_num(np.array([first.place]))
+    latitude, longitude, height = (float(value) for value in transform(place)[0])
     if not all(map(math.isfinite, (latitude, longitude, height))) or abs(latitude) > 90 or abs(height) > _MAX_HEIGHT_M:
         raise CaptureError(
             f"{file}: line {first.number}: {', '.join(f'{value:.10g}' for value in first.place)} is no place in "
             f"{system}. Is it the right system, and x (east) before y (north)?"
         )
-    return latitude, longitude, height
+    return latitude, longitude, math.nan if flat else height
 
 
 def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, float, float], file: Path) -> None:
@@ -216,18 +237,20 @@ def _number(word: str) -> float:
 def _line(row: Row, file: Path, units: tuple[float, ...]) -> _Line:
     number, words = row
     try:
-        x, y, z, across, down = map(_number, words[:5])
+        flat = words[2].strip().lower() in UNKNOWN or number_of(words[2]) in NO_DATA
+        x, y, z, across, down = map(_number, [*words[:2], "0" if flat else words[2], *words[3:5]])
         photograph = words[5].strip()
     except (ValueError, IndexError):
         alone = " Surveyed points alone do not say where photographs show them." if len(words) < 6 else ""
         line = " ".join(words)[:80]
+        alone = alone or " (nan for a height that is not known.)"
         raise CaptureError(
             f"{file}: line {number}: {line!r} is not `x y z px py photograph [name]`. Mend the line.{alone}"
         ) from None
     if not all(map(math.isfinite, (x, y, z, across, down))):
         raise CaptureError(f"{file}: line {number}: numbers must be finite. Mend the line.")
     name = words[6].strip() if len(words) > 6 else ""
-    place = x * units[0], y * units[1], z * units[2]
+    place = x * units[0], y * units[1], math.nan if flat else z * units[2]  # the one NaN: places of it are equal
     return _Line(number, place, (across, down), photograph, name)
 
 
@@ -286,7 +309,7 @@ def _checked(points: list[GroundControlPoint], system: str, file: Path, notes: S
         )
     control = GcpList(tuple(seen), system, file.name, tuple(notes))
     targets = control.enu(control.median_origin)[[not point.is_check_point for point in seen]]
-    if used and is_collinear(targets):
+    if used and is_collinear(np.nan_to_num(targets)):
         raise CaptureError(
             f"{file}: its points lie along one line, about which a scene could still turn. Survey one beside it, or "
             f"use them as check points: --check-points {ALL_POINTS}"

@@ -81,7 +81,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
 def _knows_altitude(prepared: ReconstructionPlan) -> bool:
     """Whether control points or positions say how high the place is."""
     control = prepared.gcps
-    return prepared.gps_priors.has_altitudes or (control is not None and control.has_control_points)
+    return prepared.gps_priors.has_altitudes or (control is not None and control.has_heights)
 
 
 def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Georegistration | AlignmentFailure:
@@ -176,8 +176,16 @@ def _by_control(
     photographs, control = prepared.image_list.images, prepared.gcps
     assert control is not None
     anyway = prepared.request.options.georeference == "anyway"
-    doubts = None if anyway else Doubts.of(model, prepared)
-    found = gcp_adjustment.adjust_to_gcps(model, control, prepared.origin, hold_focal, prepared.threads, doubts)
+    doubts = Doubts.of(model, prepared)
+    gps = doubts.by_gps
+    place = gps.accuracy.place_m if gps is not None and gps.accuracy is not None else None
+    level = gcp_adjustment.Level(
+        up=doubts.up.direction, deviation_deg=doubts.up.deviation_deg, gps=None if gps is None else gps.similarity,
+        gps_up_m=place[1] if place is not None and len(place) > 1 else None,
+    )  # fmt: skip
+    found = gcp_adjustment.adjust_to_gcps(
+        model, control, prepared.origin, hold_focal, prepared.threads, level, None if anyway else doubts
+    )
     notes = found.notes
     if prepared.scale_bars is not None:
         factor, _ = known_scale(found.model, prepared.scale_bars)

@@ -189,8 +189,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
         geodetic[index], kinds[index] = row.position, f"as in {table.name}"
         if not np.isfinite(row.position[2]):
             geodetic[index, 2], kinds[index] = _altitude_beside(photographs[index])
-    notes = [*read.notes, *_unmatched(read.rows, rows, table)]
-    _refuse_exchanged(geodetic, photographs, table)
+    notes = [*read.notes, *_unmatched(read.rows, rows, table), *_far_off(geodetic, photographs, table)]
     without = [index for index, row in rows.items() if not np.isfinite(row.position[2])]
     if without:
         chosen = np.isin(np.arange(len(names)), without)
@@ -221,19 +220,20 @@ def _without_single_zeros(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray
     return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
 
 
-def _refuse_exchanged(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: Path) -> None:
-    """Raise CaptureError where a table's positions become those of the photographs once exchanged or mirrored."""
+def _far_off(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: Path) -> list[str]:
+    """What to say of a table whose positions are not near those in the photographs. Raises CaptureError where they
+    become those once exchanged or mirrored."""
     own = np.array([photo.lat_lon or (np.nan, np.nan) for photo in photographs])
     both = np.isfinite(own).all(axis=1) & np.isfinite(geodetic[:, :2]).all(axis=1)
     if both.sum() < MIN_POSITIONS:
-        return
+        return []
     given, own = geodetic[both, :2], own[both]
 
     def fits(places: np.ndarray) -> bool:
         return bool(np.abs(np.median(wrap_degrees(places - own), axis=0)).max() < SAME_FLIGHT_DEG)
 
     if fits(given):
-        return
+        return []
     ways = {
         "latitude and longitude are exchanged": given[:, ::-1],
         "south is north": given * [-1, 1], "west is east": given * [1, -1],
@@ -245,6 +245,12 @@ def _refuse_exchanged(geodetic: np.ndarray, photographs: Sequence[ImageMetadata]
             f"{table}: {wrong}, as the positions in the photographs tell ({own[0][0]:.5f}, {own[0][1]:.5f}; here "
             f"{given[0][0]:.5f}, {given[0][1]:.5f}). Mend its columns or their names."
         )
+    places = np.append(given, np.zeros((len(given), 1)), axis=1)
+    away = np.linalg.norm(enu_from_geodetic(places, (own[0][0], own[0][1], 0.0)), axis=1)
+    return [
+        f"{table.name}: its positions lie {np.median(away) / 1000:,.0f} km from those in the photographs, and are used "
+        "all the same. Another system or zone, or x and y exchanged?"
+    ]
 
 
 def _altitude_beside(photo: ImageMetadata) -> tuple[float, str]:
