@@ -20,7 +20,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.ply_reader import read_point_cloud
-from vdgs.captures.formats.source_capture import Intrinsics
+from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints
 from vdgs.captures.image_files import decode_mask
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -151,6 +151,9 @@ def test_intrinsics_per_frame_splits_and_masks(tmp_path, scene):
     assert_sees_the_scene(capture, scene)
     assert [view.split for view in capture.views] == ["train"] * 9 + ["test"] * 3
     assert all(view.mask_path == tmp_path / "masks" / "one.png" for view in capture.views)
+    (tmp_path / "masks" / "one.png").unlink()
+    with pytest.raises(CaptureError, match=r"one\.png: no such mask, though .* is said to have it"):
+        load_capture(tmp_path)
 
 
 def test_frames_in_no_list_are_left_out_and_told(tmp_path, scene):
@@ -249,9 +252,13 @@ def test_transforms_json_is_read_where_it_says_what_a_model_cannot(tmp_path, sce
 
 def test_points_of_a_model_stand_in_for_a_missing_cloud(tmp_path, scene):
     """As older nerfstudio left folders: poses moved by applied_transform, a model that is not, and no cloud."""
-    write_transforms(tmp_path, scene, shifted_by_nerfstudio(), ply_file_path=None)
+    write_transforms(tmp_path, scene, shifted_by_nerfstudio(), ply_file_path="gone.ply")
+    assert any("gone.ply: is not there" in each for each in load_capture(tmp_path).warnings)
     (tmp_path / "sparse_pc.ply").unlink()
-    with pytest.raises(CaptureError, match=r"brings no 3D points(?s:.)* as sparse/0 .* and give --format transforms\."):
+    with pytest.raises(
+        NoTiePoints,
+        match=r"gone\.ply is not there, brings no 3D points(?s:.)* as sparse/0 .* and give --format transforms\.",
+    ):
         load_capture(tmp_path)
     write_colmap(tmp_path, moved(scene, 3.0, np.eye(3)[[1, 2, 0]], np.ones(3)), images=None)
     capture = load_capture(tmp_path, CaptureOptions(up="z", format="transforms"))

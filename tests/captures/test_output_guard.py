@@ -57,6 +57,14 @@ def test_other_places_in_a_capture_are_free(root: Path, beside: str) -> None:
     assert contents(root) == before  # nor makes what it was asked about
 
 
+@pytest.mark.parametrize("inside", ["blocks/x.ply", "coarse", "evaluation_off_path/new/x.mp4", "lod"])
+def test_folders_of_stages_are_for_the_stages(tmp_path: Path, inside: str) -> None:
+    (tmp_path / "config.yaml").write_text("vdgs:\n")
+    with pytest.raises(VdgsError, match="which a stage of the run"):
+        check_output(tmp_path / inside)
+    check_output(tmp_path / "export" / "blocks" / inside)  # raises nothing
+
+
 def test_relative_names_and_links_lead_to_the_same_folder(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (root.parent / "link").symlink_to(root / "images_4")
     (root.parent / "film.mp4").symlink_to(root / "images_4" / "frame_000.png")

@@ -62,7 +62,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["run", "--help"], ["train-coarse", "--help-all", "--preset", "paper"], ["eval", "-h"]]
+    "arguments",
+    [
+        ["--help"],
+        ["--help-all"],
+        ["run", "--help"],
+        ["train-coarse", "--help-all", "--preset", "paper"],
+        ["eval", "-h"],
+    ],
 )
 def test_help_imports_nothing_heavy(arguments, place):
     code, out, _ = answer(place, *arguments)

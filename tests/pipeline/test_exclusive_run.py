@@ -99,6 +99,8 @@ CHANGES: dict[str, Callable[[Path, Path], list[object]]] = {
     "another merge": lambda _, run: ["merge", run, "--rule", "max-visibility"],
     "moved, for visibility": lambda place, run: ["visibility", run, "--capture", moved(place)],
     "moved, for figures": lambda place, run: ["eval", run, "--capture", moved(place)],
+    "moved, for maps": lambda place, run: ["ortho", run, "--capture", moved(place)],
+    "moved, for other programs": lambda place, run: ["export", run, "--capture", moved(place), "--output", "x.ply"],
     "moved, for a run": lambda place, run: ["run", moved(place), "--output", run, *OPTIONS],
 }  # fmt: skip
 

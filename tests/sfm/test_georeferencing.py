@@ -15,6 +15,7 @@ from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm import georegistration
+from vdgs.sfm.flights import untrusted_offsets
 from vdgs.sfm.georeferencing import FOOT_M, Doubts
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
@@ -248,6 +249,18 @@ def test_positions_that_are_another_flights_are_left_out():
     assert not fit.inliers[[3, 17, 20]].any()
     assert fit.inliers.sum() >= 27
     assert fit.similarity.scale == pytest.approx(SCALE, rel=0.02)
+
+
+def test_altitudes_of_a_flight_that_is_not_trusted_are_said():
+    """They drift, and count from elsewhere: no datum explains them, and what they say otherwise is no secret."""
+    flights, trusted = np.repeat([0, 1, 2], [20, 10, 2]), np.arange(32) < 20
+    off = np.where(trusted, 0.02, np.linspace(-44, -33, 32))
+    offsets = untrusted_offsets(off, trusted, flights)
+    assert offsets is not None
+    assert offsets.different == [pytest.approx(np.median(off[20:30]))]
+    assert (offsets.reference == trusted).all()
+    assert untrusted_offsets(off, trusted | (np.arange(32) == 22), flights) is None  # one that is trusted says enough
+    assert untrusted_offsets(off / 10, trusted, flights) is None
 
 
 def test_along_a_line_up_is_what_is_known_without_positions():

@@ -36,7 +36,7 @@ def find_masks(
     for view in views:
         photograph = view.image_path or find_file(root / images, view.name)
         mask = view.mask_path or find_mask(folder, view.name)
-        if mask is not None and photograph is not None and mask.samefile(photograph):
+        if mask is not None and photograph is not None and mask.is_file() and mask.samefile(photograph):
             raise CaptureError(
                 f"{mask}: is the photograph itself, not a mask of it. Name the folder of the masks (--masks)."
             )

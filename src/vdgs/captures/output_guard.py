@@ -6,7 +6,7 @@ does the work, for those who call it from Python. What is allowed:
 
 - a folder beside the photographs, also in a capture whose photographs lie in `images/`, and in a project's folder whose
   photographs lie in folders of their own (`project/DCIM`, `project/run`);
-- anything in a run or a capture but its inputs, wherever the run or capture lies;
+- anything in a run but the folders of its stages, and in a capture but its inputs, wherever the run or capture lies;
 - a new folder in a capture whose photographs lie in its root (no file there);
 - a folder of results (a render, maps): they are no photographs (`strays.why_not_read`).
 """
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 #: What the folders of a capture that hold its inputs are usually called, in its root.
 _USUAL = re.compile(r"images(_\d+)?|masks|sparse|colmap", re.IGNORECASE)
+#: What the stages of a run call their folders in it.
+_OF_STAGES = re.compile(r"coarse|visibility|partition|blocks|merged|lod|evaluation(_\w+)?")
 #: The same in the parts `train` and `val` of a capture in Mega-NeRF's layout.
 _MEGA_NERF = ("rgbs", "metadata")
 #: What cameras call the folder of all that they took.
@@ -62,6 +64,11 @@ def check_output(output: Path) -> None:
 def _check_not_in_capture(output: Path, real: Path) -> None:
     for folder in (real, *real.parents):
         parent = folder.parent
+        if _OF_STAGES.fullmatch(folder.name) and is_run(parent):
+            raise VdgsError(
+                f"{output}: lies in {folder}, which a stage of the run {parent} fills and clears. Nothing was written. "
+                f"Choose another place, such as {parent / 'export' / real.name}"
+            )
         if _USUAL.fullmatch(folder.name) and is_capture(parent):
             raise _error(output, folder, parent)
         if folder.name in _MEGA_NERF and is_mega_nerf(parent.parent):

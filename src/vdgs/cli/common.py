@@ -37,11 +37,16 @@ class QuietArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageArguments(RunPath, QuietArguments):
+class CaptureArguments:
     """What verbs take that read the capture of a run."""
 
     capture: Path | None = None
     """Where the capture lies now, if it was moved; the run remembers it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageArguments(RunPath, QuietArguments, CaptureArguments):
+    """What the stages of a run take."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vdgs`. Exit codes: 0 done, 1 an error that the message explains, 2 usage, 130 stopped; 3 from
     `vdgs status`, of a run that is not whole."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    if not arguments or arguments[0] in ("-h", "--help", "--help-all", "help"):
         sys.exit(exit_code_of("vdgs", lambda: print(HELP, end="") or (0 if arguments else 2), ""))
     if arguments[0] in ("--version", "-v", "-V", "version"):
         from vdgs import __version__

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from vdgs.cli.common import (
+    CaptureArguments,
     QuietArguments,
     ShardArguments,
     StageArguments,
@@ -131,7 +132,7 @@ def render_command(arguments: list[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrthoArguments(OrthoRequest, ShardArguments, QuietArguments):
+class OrthoArguments(OrthoRequest, ShardArguments, QuietArguments, CaptureArguments):
     """Make maps of a run: orthophoto, surface model and visibility as GeoTIFFs, hillshade and preview as PNG.
 
     Needs rasterio and pyproj: pip install 'vdgs[geo]'.
@@ -144,7 +145,7 @@ def ortho_command(arguments: list[str]) -> None:
     from vdgs.runs.run_context import RunContext
 
     device = set_up_compute(args.device, args.threads)
-    execution, context = args.execution(device), RunContext.from_path(args.run)
+    execution, context = args.execution(device), RunContext.from_path(args.run, args.capture)
     render_ortho(context, replace(args, device=device), make_console(args.quiet), execution)
 
 

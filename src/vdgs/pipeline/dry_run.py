@@ -27,6 +27,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, get_run_status
 from vdgs.sfm.films.take_frames import temporary_frames
 from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
+from vdgs.sfm.reconstruct import check_nothing_trained
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request, size_apart
 from vdgs.sfm.sfm_estimate import estimate_sfm
@@ -67,6 +68,7 @@ def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstim
         options = replace(run_request.options, gps=None, scale_bar=None)
         with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
         return estimate_run(with_capture, console)
+    check_nothing_trained(request, RunFolder(run_request.output))
     with temporary_frames(request, console) as with_frames:
         plan = plan_reconstruction(with_frames)
         sfm = estimate_sfm(plan)

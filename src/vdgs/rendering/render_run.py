@@ -93,6 +93,8 @@ def render_run(request: RenderRequest, console: Console) -> None:
     run = replace(run, model=scene) if isinstance(scene, AnchorModel) else run
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    if request.seconds and request.path is None and request.views in ("test", "train"):
+        console.print(f"[yellow]note[/] --seconds is of camera paths; --views {request.views} draws one frame a view")
     named, fps = _named_cameras(request, run_cameras)
     if request.width:
         named = [(name, camera.resized(request.width, _height(camera, request.width))) for name, camera in named]

@@ -115,6 +115,20 @@ def altitude_offsets(
     return AltitudeOffsets((levels - levels[0])[nearest], nearest == 0)
 
 
+def untrusted_offsets(off: np.ndarray, trusted: np.ndarray, labels: np.ndarray) -> AltitudeOffsets | None:
+    """The same of flights none of whose positions is `trusted` [n], by how far recorded altitudes are above the placed
+    ones [n]: where one drifts, no single datum explains it, and its median is told. None where all are near."""
+    over = np.zeros(len(off))
+    for flight in np.unique(labels[~trusted]):
+        here = labels == flight
+        apart = float(np.median(off[here]))
+        error = 1.25 * float(np.std(off[here])) / np.sqrt(here.sum())
+        enough = here.sum() >= LEAST_PHOTOGRAPHS and not trusted[here].any()
+        if enough and abs(apart) > max(LEAST_OFFSET_M, LEAST_SIGMAS * error):
+            over[here] = apart
+    return AltitudeOffsets(over, trusted) if over.any() else None
+
+
 def _medians(
     off: np.ndarray, members: np.ndarray, plane: np.ndarray, tilt: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

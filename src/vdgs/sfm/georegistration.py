@@ -14,7 +14,7 @@ from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
-from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets
+from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -115,6 +115,8 @@ def georegister(
         )
     levelled, offsets = _without_offsets(problem, positions, rows)
     fit, barometer = _best_fit(levelled, taken)
+    if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
+        offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
@@ -199,10 +201,13 @@ def _place_error(
 
 def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
     over = [f"{off:+.0f} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different]
+    up = fit.place_error_m[1]
+    fixed = up < min(map(abs, offsets.different))  # by RTK alone (`_place_error`)
+    good = f"±{up:.2g} m above their own zero, be it the ellipsoid (RTK) or the sea" if fixed else f"±{up:.0f} m"
     return [
         f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?): {', '.join(over)} over "
         f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the "
-        f"latter, good to ±{fit.place_error_m[1]:.0f} m. A table of positions (--gps) with one datum mends it."
+        f"latter, good to {good}. A table of positions (--gps) with one datum mends it."
     ]
 
 

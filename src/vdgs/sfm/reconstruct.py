@@ -144,6 +144,11 @@ def writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
 def check_nothing_trained(request: SfmRequest, run: RunFolder | None) -> None:
     """Raise RunError where a capture is about to change that a run was trained on."""
     if run is not None and run.is_trained and not request.overwrite:
+        if SourceImages.read(run.own_capture) is None and run.config_file.exists():
+            raise RunError(
+                f"{run.path}: is a run of the capture {run.settings().capture_path}, not of these photographs. Take "
+                "another --output; --overwrite discards what was trained."
+            )
         raise RunError(
             f"{run.path}: its capture was made with other positions or other settings of the reconstruction (--sfm.*, "
             "--gps), and the run was trained on it. Add --overwrite to do both again, give the old settings to "

@@ -110,7 +110,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
-    points, colors = _points(root, content, file, poses, needs_points)
+    points, colors = _points(root, content, file, poses, needs_points, warnings)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
@@ -202,11 +202,18 @@ def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.
 
 
 def _points(
-    root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray], needs_points: bool
+    root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray], needs_points: bool, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
-    if ply is not None:
-        return read_point_cloud(root / safe_name(str(ply), file, "ply_file_path", root))
+    cloud = None if ply is None else root / safe_name(str(ply), file, "ply_file_path", root)
+    if cloud is not None and cloud.is_file():
+        return read_point_cloud(cloud)
+    what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
     option = " and give --format transforms"
-    return find_sparse_points(root, poses, TRANSFORMS_FILE, option=option, needs_points=needs_points)
+    found = find_sparse_points(root, poses, what, option=option, needs_points=needs_points)
+    if cloud is not None:
+        notes.append(
+            f"{cloud}: is not there, though {TRANSFORMS_FILE} names it; {len(found[0]):,} points beside it are used."
+        )
+    return found

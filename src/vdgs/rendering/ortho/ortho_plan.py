@@ -149,8 +149,8 @@ def staging_folder(folder: Path) -> Iterator[Path]:
                 raise reason_of(error, staging) from error
     except OSError as error:
         raise VdgsError(
-            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space or give another "
-            "--output; maps that were there are kept."
+            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space, allow writing "
+            "there, or give another --output; maps that were there are kept."
         ) from error
     finally:
         if folder.is_dir() and not any(folder.iterdir()):
