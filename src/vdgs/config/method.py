@@ -158,7 +158,7 @@ class LossConfig:
     pseudo_views: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Weight of views that nobody photographed, nearer and more tilted than a photograph: every fifth step also draws
     one and compares it with the photograph where depths agree. 0.3 makes views from where nobody flew better, for a
-    fifth more time (choice). On a GPU these steps take slower kernels."""
+    sixth more time (choice). On a GPU these steps take slower kernels."""
     background: Literal["mean", "black"] = "mean"
     """Color behind the scene: the mean of the training photographs (choice), or black."""
     random_background: Annotated[float, FRACTION] = 1.0

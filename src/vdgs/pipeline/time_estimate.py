@@ -43,7 +43,7 @@ MAX_CROWDING, CROWD_SPREAD = 20.0, 3.0
 #: (measured: 0.02 to 0.05 s and 0.1 to 0.4 s at 320 to 407 pixels of width), in processor seconds.
 MOTION_VIEW_STEPS, MOTION_VIEW_SECONDS = 0.7, 0.3
 #: Time that pseudo views (`loss.pseudo_views`) add to the steps of a stage, as a share (measured).
-PSEUDO_VIEWS_SHARE = 0.2
+PSEUDO_VIEWS_SHARE = 0.16
 #: Share of a photograph's stereo that confirming its depths adds to finding them.
 CONFIRMING = 0.15
 #: What measuring a view takes, in training steps of its size: of the coarse model, and of the merged one with its
