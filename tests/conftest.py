@@ -15,7 +15,7 @@ import signal
 import sys
 from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -56,8 +56,19 @@ jaxtyping.jaxtyped = typecheck.jaxtyped
 jaxtyping.install_import_hook([module_name(file) for file in files_with_shapes()], f"{typecheck.__name__}.checked")
 
 
-def pytest_configure() -> None:
+def pytest_configure_node(node: Any) -> None:
+    """Tell each worker of the server from which all fork their commands: it takes seconds to start."""
+    from support.commands import begin_server
+
+    node.workerinput["commands"] = begin_server({"VDGS_THREADS": "1", "OMP_NUM_THREADS": "1"})
+
+
+def pytest_configure(config: pytest.Config) -> None:
     """Heed the signals that tests send to commands, which inherit what `nohup` and shells in the background ignore."""
+    if address := getattr(config, "workerinput", {}).get("commands"):
+        from support.commands import use_server
+
+        use_server(address)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for name in (signal.SIGHUP, signal.SIGQUIT):
         signal.signal(name, signal.SIG_DFL)

@@ -30,7 +30,7 @@ from vdgs.geometry.geodesy import enu_axes
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 
 MODULES = Path(os.environ.get("VDGS_NODE") or "none") / "node_modules"
-SIZE = 256
+SIZE = 128
 STYLE = """<!doctype html><style>html, body { margin: 0; background: black; overflow: hidden }</style><script>
 window.addEventListener("error", event => { document.title = "failed: " + event.message; });
 window.addEventListener("unhandledrejection", event => { document.title = "failed: " + event.reason; });
@@ -138,7 +138,7 @@ try {
 } catch (error) { document.title = "failed: " + error; }
 """
 CESIUM_HEAD = """<style>.cesium-viewer-bottom, .cesium-viewer-toolbar { display: none !important }
-#scene, .cesium-viewer, .cesium-widget, .cesium-widget canvas { width: 256px; height: 256px }</style>
+#scene, .cesium-viewer, .cesium-widget, .cesium-widget canvas { width: 128px; height: 128px }</style>
 <script>window.CESIUM_BASE_URL = "/node_modules/cesium/Build/Cesium/"</script>
 <script src="/node_modules/cesium/Build/Cesium/Cesium.js"></script><div id="scene"></div>"""
 #: By a program of `--for`: its package and file on npm, and what shows a scene in it.

@@ -72,6 +72,14 @@ def assert_fails_then_works(
 ) -> None:
     """The law: words instead of traces, exit code 1, what was there stays whole, no leftovers, then the same command
     works."""
+    kept = assert_fails(disk, free_bytes, *command, prepare=prepare)
+    assert_works(disk, kept, *command)
+
+
+def assert_fails(
+    disk: SmallDisk, free_bytes: int, *command: object, prepare: Callable[[], None] | None = None
+) -> dict[str, bytes]:
+    """Fill the disk for a command and empty it again. Returns what the command left there."""
     before = disk.results()
     disk.leave(free_bytes)
     failed = vdgs(*command, prepare=prepare)
@@ -83,10 +91,14 @@ def assert_fails_then_works(
     assert {name: after.get(name) for name in before} == before, command
     assert disk.leftovers() == []
     disk.empty()
+    return {name: content for name, content in after.items() if name not in before}
+
+
+def assert_works(disk: SmallDisk, kept: dict[str, bytes], *command: object) -> None:
     done = vdgs(*command)
     assert done.returncode == 0, f"{command}: {done.stderr}"
-    kept = {name: content for name, content in disk.results().items() if name in after and name not in before}
-    assert kept == {name: after[name] for name in kept}, "a half file stood under its final name"
+    found = disk.results()
+    assert kept == {name: found.get(name) for name in kept}, "a half file stood under its final name"
 
 
 def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_same_bits(disk, native_small):
@@ -105,28 +117,22 @@ def test_every_stage_of_a_run_says_that_the_disk_is_full_and_continues_to_the_sa
         assert (run / model).read_bytes() == (native_small.whole / model).read_bytes()
 
 
+def test_exported_files_are_whole_or_absent(disk, native_small):
+    """A command each that fails, and one for all when there is room again."""
+    names = (
+        "a.ply", "a.compressed.ply", "a.points.ply", "a.spz", "a.splat", "a.sog", "a.las", "a.laz", "a.glb", "a.html",
+        "a.rad", "tiles/tileset.json", "lod/lod-meta.json", "place/scene.json",
+    )  # fmt: skip
+    command, kept = ("export", native_small.whole, *FITTED), dict[str, bytes]()
+    for name in names:
+        kept |= assert_fails(disk, 4 << 10, *command, "--output", disk.folder / name)
+    assert_works(disk, kept, *command, *(word for name in names for word in ("--output", disk.folder / name)))
+    assert all((disk.folder / name).stat().st_size > 0 for name in names)
+
+
 @pytest.mark.parametrize(
     "command",
     [
-        *(
-            ("export", "RUN", *FITTED, "--output", f"DISK/{name}")
-            for name in (
-                "a.ply",
-                "a.compressed.ply",
-                "a.points.ply",
-                "a.spz",
-                "a.splat",
-                "a.sog",
-                "a.las",
-                "a.laz",
-                "a.glb",
-                "a.html",
-                "a.rad",
-                "tiles/tileset.json",
-                "lod/lod-meta.json",
-                "place/scene.json",
-            )
-        ),
         ("view", "RUN", "--static", "DISK/site"),
         ("render", "RUN", "--output", "DISK/views"),
         ("render", "RUN", "--mode", "depth", "--raw", "--output", "DISK/numbers"),

@@ -5,7 +5,7 @@
         command.wait_until_paused()
         command.send_signal(signal.SIGKILL)
 
-One server for each worker of the tests imports the package once; every command is forked from it, and so are the
+One server for all workers of the tests imports the package once; every command is forked from it, and so are the
 processes that it starts itself, such as those of blocks (`forking`), unless it is asked to start them as people's do
 (`start_tasks`) or to do in its own what they would (`do_tasks_here`). `entry_point` is a whole `python -m vdgs`,
 `python` any code in such a process.
@@ -22,17 +22,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from support.forking import fork_tasks
 from support.pausing import Pause, pause_where_asked
 
 if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     from vdgs.distributed.executor import Task, TaskListener, TaskResult
 
 #: What nothing takes that still goes on, however busy the machine is. The limit of a whole test is larger still.
@@ -44,6 +47,8 @@ FEW_STEPS = 2
 #: Seconds between two looks at what is waited for.
 GLANCE_SECONDS = 0.01
 
+#: Verbs that start processes, and options with which others do. For the rest nothing waits that could fork some.
+STARTING = {"run", "train-blocks", "bench", "--jobs", "--executor"}
 #: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
     "tests.support.without_collector",  # found where the tests begin in the repository's folder
@@ -79,6 +84,27 @@ IMPORTED = [
 _PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
 if sys.platform == "linux":
     _PROCESSES.set_forkserver_preload(IMPORTED)
+
+
+def begin_server(variables: Mapping[str, str]) -> str:
+    """Start the server here, with more environment variables; returns its address, for `use_server` in other processes,
+    or nothing where each has its own."""
+    if sys.platform != "linux" or hasattr(forkserver._forkserver, "_forkserver_authkey"):  # from Python 3.14 on
+        return ""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update({name: value for name, value in variables.items() if before[name] is None})
+    forkserver.ensure_running()
+    for name in (name for name, value in before.items() if value is None):
+        del os.environ[name]
+    return str(forkserver._forkserver._forkserver_address)  # type: ignore[attr-defined]
+
+
+def use_server(address: str) -> None:
+    """Let commands of this process be forked from the server of another, which outlives it."""
+    server = forkserver._forkserver
+    server._forkserver_address = address  # type: ignore[attr-defined]
+    server._forkserver_alive_fd = os.open(os.devnull, os.O_RDONLY)  # type: ignore[attr-defined]
+    server.ensure_running = resource_tracker.ensure_running  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True)
@@ -239,13 +265,13 @@ def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def wait_until(condition: Callable[[], object]) -> None:
-    """Return once the condition holds; fail if that never comes."""
-    began = time.monotonic()
-    end = began + PATIENCE_SECONDS
+    """Return once the condition holds; fail if that never comes. To look may cost more than what is waited for, and
+    what takes long is looked at as seldom."""
+    start = began = time.monotonic()
     while not condition():
         looked = time.monotonic()
-        assert looked < end, "waited in vain"
-        time.sleep(max(GLANCE_SECONDS, looked - began))  # to look may cost more than what is waited for
+        assert looked < start + PATIENCE_SECONDS, "waited in vain"
+        time.sleep(max(GLANCE_SECONDS, 3 * (looked - began), (looked - start) / 50))
         began = time.monotonic()
 
 
@@ -288,7 +314,8 @@ def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[s
 
 
 def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
-    fork_tasks()
+    if prepare is not do_tasks_here and STARTING & {*arguments}:
+        fork_tasks()
     spare_seconds()
     if prepare is not None:
         prepare()
@@ -299,26 +326,42 @@ def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
 
 @contextmanager
 def small_figures() -> Iterator[None]:
-    """Draw figures of so few pixels as still makes files of them: what they show, others test."""
-    from vdgs.report import charts
-    from vdgs.system import figure_style as style
-
-    before = style.DPI, charts.DPI
-    style.DPI = charts.DPI = SMALL_DPI
+    """Draw figures of so few pixels as still makes files of them, and no ticks: what they show, others test."""
+    restore = _draw_small_figures()
     try:
         yield
     finally:
-        style.DPI, charts.DPI = before
+        restore()
+
+
+def _draw_small_figures() -> Callable[[], None]:
+    """Returns what draws them as before."""
+    from vdgs.report import charts
+    from vdgs.system import figure_style as style
+
+    sizes, draw = (style.DPI, charts.DPI), style.FigureCanvasAgg.print_png
+
+    @wraps(draw)
+    def draw_without_ticks(canvas: FigureCanvasAgg, *arguments: Any, **named: Any) -> None:
+        for axes in canvas.figure.axes:
+            axes.set_axis_off()
+        draw(canvas, *arguments, **named)
+
+    def restore() -> None:
+        style.DPI, charts.DPI = sizes
+        style.FigureCanvasAgg.print_png = draw  # type: ignore[method-assign]
+
+    style.DPI = charts.DPI = SMALL_DPI
+    style.FigureCanvasAgg.print_png = draw_without_ticks  # type: ignore[method-assign]
+    return restore
 
 
 def spare_seconds() -> None:
     """Let this process, which ends with a command, draw small figures and time few steps before it trains: how near
     estimates come, others test."""
     from vdgs.pipeline import time_estimate
-    from vdgs.report import charts
-    from vdgs.system import figure_style as style
 
-    style.DPI = charts.DPI = SMALL_DPI
+    _draw_small_figures()
     time_estimate.MIN_TIMED_STEPS, time_estimate.MAX_TIMED_SECONDS = FEW_STEPS, 0.0
 
 

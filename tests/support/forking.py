@@ -65,8 +65,9 @@ class _Forked:
         return self._code
 
     def wait(self) -> int:
+        began = time.monotonic()
         while (code := self.poll()) is None:
-            time.sleep(GLANCE_SECONDS)
+            time.sleep(max(GLANCE_SECONDS, (time.monotonic() - began) / 50))
         return code
 
     def terminate(self) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from support.captures import tiny_scene, write_colmap
 from support.commands import vdgs
 
-ITERATIONS, BLOCK_ITERATIONS = 200, 120
+ITERATIONS, BLOCK_ITERATIONS = 120, 100
 SETTINGS = (
     "--preset",
     "laptop",

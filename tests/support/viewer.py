@@ -224,8 +224,8 @@ class Browser:
         self._process = subprocess.Popen(
             [
                 command, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-                "--disable-dev-shm-usage", "--disable-gpu-rasterization", "--no-first-run", "--disable-extensions", "--remote-debugging-port=0",
-                f"--user-data-dir={self._profile.name}", "about:blank",
+                "--disable-dev-shm-usage", "--disable-gpu-rasterization", "--no-first-run", "--disable-extensions",
+                "--remote-debugging-port=0", f"--user-data-dir={self._profile.name}", "about:blank",
             ],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
