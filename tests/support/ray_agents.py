@@ -7,15 +7,19 @@ to start.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
 
-#: For the program of an agent, the names of the ports that a node waits for.
-PORTS = {
+#: For a program, the names of the ports that a node waits for. The last two are no agents: they scale clusters, and
+#: print elsewhere what is logged.
+PORTS: dict[str, tuple[str, ...]] = {
     "dashboard/agent.py": ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port"),
     "runtime_env/agent/main.py": ("runtime_env_agent_port",),
+    "autoscaler/_private/monitor.py": (),
+    "_private/log_monitor.py": (),
 }
 
 
@@ -28,7 +32,10 @@ def stand_in_for_agents() -> None:
                 file = Path(options["session-dir"], f"{name}_{options['node-id']}")
                 (begun := file.with_name(f"{file.name}.begun")).write_text("-1")
                 begun.rename(file)  # a node reads it as soon as it is there
-            sys.stdin.read()
+            if names:
+                sys.stdin.read()
+            else:
+                signal.pause()
             os._exit(0)
 
 
