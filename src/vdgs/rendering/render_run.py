@@ -123,10 +123,10 @@ def _with_fade(request: RenderRequest, run: OpenedModel, scene: Drawable, camera
         least = 0 if photographs or request.mode != "rgb" else FADE_BELOW
     if not least:
         return scene
-    in_levels = isinstance(scene, LodScene)
-    visibility = (
-        count_visibility(scene.tree.gaussians(0).means, cameras) if in_levels else get_run_visibility(run, cameras)
-    )
+    if isinstance(scene, LodScene):
+        visibility = count_visibility(scene.tree.gaussians(0).means, cameras)
+    else:
+        visibility = get_run_visibility(run, cameras)
     if request.min_visibility is not None:
         require_some_seen(visibility, least)
     elif not bool((visibility >= least).any()):
