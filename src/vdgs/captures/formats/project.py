@@ -23,7 +23,7 @@ from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import find_photographs
 from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView
-from vdgs.captures.formats.sparse_points import find_point_cloud
+from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -212,6 +212,8 @@ def _cloud_beside(
         cloud = las
     if cloud is None:
         more = f" {las} is not read: it needs pip install 'vdgs[geo]'." if las is not None else ""
+        if several := sorted(each.name for each in {*root.glob("*.ply"), *project.file.parent.glob("*.ply")}):
+            more += f" Several are there ({', '.join(several[:3])}): call the one that is meant {POINT_CLOUDS[0]}."
         raise NoTiePoints(
             f"{project.file}: brings poses but no 3D points, from which the scene starts. This finds them, with the "
             f"poses as they are: vdgs sfm {shell_word(_given(project, root))} --output CAPTURE\nOr put a point cloud "
