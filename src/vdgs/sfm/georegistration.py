@@ -74,13 +74,9 @@ class AlignmentFailure:
 
 
 def georegister(
-    model: pycolmap.Reconstruction,
-    images_metadata: Sequence[ImageMetadata],
-    positions: GpsPriors,
-    scale: tuple[float, float] | None = None,
-    anyway: bool = False,
-    stated: bool = False,
-) -> Georegistration | AlignmentFailure:
+    model: pycolmap.Reconstruction, images_metadata: Sequence[ImageMetadata], positions: GpsPriors,
+    scale: tuple[float, float] | None = None, anyway: bool = False, stated: bool = False,
+) -> Georegistration | AlignmentFailure:  # fmt: skip
     """The similarity that brings the model to its positions, or why they do not tell one: they are too few, or wrong by
     too much of how far they spread. `scale` is the factor to metres where it is known otherwise, and its standard
     deviation as a share; `stated` whether the deviations of the positions are more than a default. Does not change the
