@@ -16,6 +16,7 @@ from vdgs.geometry.camera import NEAR_PLANE, Camera, CameraModel
 from vdgs.model.anchors import Anchors
 from vdgs.training.schedule import view_sampling_weights
 from vdgs.visibility.visibility_counts import (
+    NearbyCameras,
     count_visibility,
     effective_sample_size,
     fade_factors,
@@ -41,6 +42,21 @@ def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Ca
 def cloud(n: int, seed: int = 1) -> np.ndarray:
     """Points on the ground and far above the cameras, float32 values in float64."""
     return np.random.default_rng(seed).uniform([-5, -5, -2], [25, 25, 14], (n, 3)).astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "orthographic"])
+def test_the_cameras_near_a_part_of_a_scene_count_and_fade_it_as_all_do(model: CameraModel) -> None:
+    cameras, points, fewer = flight(40, model), torch.from_numpy(cloud(4000)), 0
+    nearby = NearbyCameras(cameras)
+    for x, y in np.ndindex(4, 4):
+        corner = torch.tensor([x, y]) * 7.5 - 5
+        part = points[((points[:, :2] >= corner) & (points[:, :2] < corner + 7.5)).all(dim=1) & (points[:, 2] < 1)]
+        near, counts = nearby.of(part), count_visibility(part, cameras)
+        assert torch.equal(count_visibility(part, near), counts)
+        assert torch.equal(fade_factors(part, counts, near, 3), fade_factors(part, counts, cameras, 3))
+        fewer += len(near) < len(cameras)
+    assert fewer == (16 if model == "pinhole" else 0)
+    assert nearby.of(points[:0]) == []
 
 
 @pytest.mark.parametrize("least", [1, 2, 4])

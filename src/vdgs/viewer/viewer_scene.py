@@ -29,7 +29,7 @@ from vdgs.runs.lod_folder import find_tree
 from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
 from vdgs.runs.visibility_store import get_run_visibility, with_fade
 from vdgs.viewer.lod import LodLevel, LodPyramid
-from vdgs.visibility.visibility_counts import count_visibility, fade_factors
+from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility, fade_factors
 
 ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
@@ -144,7 +144,8 @@ class ViewerScene:
         return self._faded_trees[name, min_visibility]
 
     def _count_fade(self, min_visibility: int, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-        return fade_factors(places, self._count_visibility(places), self._cameras, min_visibility)
+        cameras = self._nearby.of(places)
+        return fade_factors(places, count_visibility(places, cameras), cameras, min_visibility)
 
     def _pyramid(self, name: str, min_visibility: int) -> LodPyramid:
         """The levels of a model without a tree."""
@@ -165,6 +166,10 @@ class ViewerScene:
     @property
     def _cameras(self) -> list[Camera]:
         return [view.camera for view in self.capture.train_views]
+
+    @cached_property
+    def _nearby(self) -> NearbyCameras:
+        return NearbyCameras(self._cameras)
 
     def level_visibility(self, name: str, level: LodLevel, camera: Camera) -> Tensor:
         """V of what a level draws in a view."""
@@ -192,7 +197,7 @@ class ViewerScene:
         return self._values[what, content]
 
     def _count_visibility(self, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-        return count_visibility(places, self._cameras).float()
+        return count_visibility(places, self._nearby.of(places)).float()
 
     def replace_run(self, run: OpenedRun) -> None:
         """Put a newer model in place of the one of its name."""

@@ -57,13 +57,48 @@ def fade_factors(
     """What opacities are multiplied with where a scene fades out at its edge, by V of each place: 1 where at least
     `min_visibility` cameras hold it; farther out it falls smoothly to 0, by how much larger pictures would have to be
     for so many to hold it."""
-    factors, rare = torch.ones_like(positions[:, 0]), visibility < min_visibility
-    if bool(rare.any()):
-        margins = [FADE_MARGIN * (step + 0.5) / FADE_STEPS for step in range(FADE_STEPS)]
-        counts = [count_visibility(positions[rare], [_widened(each, margin) for each in cameras]) for margin in margins]
-        held = (torch.stack(counts) >= min_visibility).float().mean(dim=0)
-        factors[rare] = (held * held * (3 - 2 * held)).to(factors)
+    factors, rare = torch.ones_like(positions[:, 0]), torch.nonzero(visibility < min_visibility)[:, 0]
+    held, left = torch.zeros_like(factors), rare
+    for step in reversed(range(FADE_STEPS)):  # the widest pictures first: what they do not hold, no others hold
+        if not len(left):
+            break
+        wide = [_widened(each, FADE_MARGIN * (step + 0.5) / FADE_STEPS) for each in cameras]
+        left = left[count_visibility(positions[left], wide) >= min_visibility]
+        held[left] += 1 / FADE_STEPS
+    factors[rare] = (held * held * (3 - 2 * held))[rare]
     return factors
+
+
+class NearbyCameras:
+    """Which of many cameras may see some places, or fade them out: of a scene's part few do, and V asks no others."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        self._cameras = list(cameras)
+        self._poses = np.array([each.camera_from_world for each in cameras]).reshape(-1, 4, 4)
+        self._is_pinhole = np.array([each.model == "pinhole" for each in cameras], bool)
+        # Planes through the camera's center and the edges of its widened picture, normals inwards: left, right, ...
+        lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras]).reshape(-1, 6).T
+        fx, fy, cx, cy, width, height = lenses
+        more = FADE_MARGIN * np.maximum(width, height) + 1
+        zero = np.zeros_like(fx)
+        planes = np.stack([
+            np.stack([fx, zero, cx + more], -1), np.stack([-fx, zero, width - cx + more], -1),
+            np.stack([zero, fy, cy + more], -1), np.stack([zero, -fy, height - cy + more], -1),
+        ], 1)  # fmt: skip
+        self._planes = planes / np.linalg.norm(planes, axis=2, keepdims=True)
+
+    def of(self, positions: Float[Tensor, "p 3"]) -> list[Camera]:
+        """Those whose pictures, widened by `FADE_MARGIN`, reach the sphere about these places; others count none."""
+        if not len(positions):
+            return []
+        low, high = (bound.double().cpu().numpy() for bound in torch.aminmax(positions.detach(), dim=0))
+        radius = float(np.linalg.norm(high - low)) / 2
+        if not np.isfinite(radius):
+            return self._cameras
+        center = self._poses[:, :3, :3] @ ((low + high) / 2) + self._poses[:, :3, 3]
+        inside = (self._planes * center[:, None]).sum(2).min(axis=1, initial=np.inf) >= -radius
+        reached = ~self._is_pinhole | (inside & (center[:, 2] >= -radius))
+        return [self._cameras[k] for k in np.flatnonzero(reached)]
 
 
 def _widened(camera: Camera, margin: float) -> Camera:
