@@ -246,7 +246,7 @@ def test_transforms_json_is_read_where_it_says_what_a_model_cannot(tmp_path, sce
         assert len(capture.test_views) == 5
     for k in range(7):
         (tmp_path / "images" / f"frame_00{k}.png").unlink()
-    with pytest.raises(CaptureError, match=r"7 of 13 images .* are missing(?s:.)*--format colmap"):
+    with pytest.raises(CaptureError, match=r"7 of 12 images .* are missing(?s:.)*--format colmap"):
         load_capture(tmp_path)
 
 

@@ -166,7 +166,7 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, tmp_path, monkeypatch
         return Path("result")
 
     monkeypatch.setattr(does, done)
-    monkeypatch.setattr("vdgs.runs.run_context.RunContext.from_path", lambda run: run)
+    monkeypatch.setattr("vdgs.runs.run_context.RunContext.from_path", lambda run, *_: run)
     get_command(verb)(["run"])
     assert capsys.readouterr().out.startswith({"report": "report: result", "ortho": "how it goes"}[verb])
     get_command(verb)(["run", "--quiet"])
