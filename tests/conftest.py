@@ -198,6 +198,15 @@ def unestimated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reconstruct, "estimate_sfm", flights.unestimated)
 
 
+@pytest.fixture
+def few_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photographs are searched at the size that they have, though they are small and few."""
+    from support import flights
+    from vdgs.sfm import feature_extraction
+
+    monkeypatch.setattr(feature_extraction, "is_upsampled", flights.not_upsampled)
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """What `-n auto` means: no workers (0) where only some files were asked for, for they take seconds to start."""
     if any(argument.partition("::")[0].endswith(".py") for argument in config.args):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,20 +39,37 @@ MISTYPED = {
 }
 
 
-def answer(folder: Path, *arguments: object) -> tuple[int, str, str]:
-    """The exit code and the output of a command that must not import anything heavy."""
-    code = (
-        "import sys\nfrom vdgs.cli.main import main\n"
-        f"try:\n    main({[str(each) for each in arguments]!r})\n"
-        f"finally:\n    print([each for each in {HEAVY!r} if each in sys.modules], file=sys.stderr)\n"
-    )
+#: Command lines one after the other in one process: exit code, output, errors, and what heavy is imported after each.
+ANSWERS = """\
+import contextlib, io, json, sys
+from vdgs.cli.main import main
+commands, heavy = json.loads(sys.argv[1])
+answers = []
+for words in commands:
+    code, out, errors = 0, io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        try:
+            main(words)
+        except SystemExit as ended:
+            code = ended.code or 0
+    answers.append((code, out.getvalue(), errors.getvalue(), [each for each in heavy if each in sys.modules]))
+print(json.dumps(answers))
+"""
+
+
+def answers_of(folder: Path, *commands: Sequence[object]) -> list[tuple[int, str, str]]:
+    """Exit code, output and errors of commands that must not import anything heavy."""
+    words = json.dumps([[[str(word) for word in command] for command in commands], HEAVY])
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, env=os.environ | {"COLUMNS": "200"}, capture_output=True, text=True,
-        timeout=PATIENCE_SECONDS,
+        [sys.executable, "-c", ANSWERS, words], cwd=folder, env=os.environ | {"COLUMNS": "200"}, capture_output=True,
+        text=True, timeout=PATIENCE_SECONDS,
     )  # fmt: skip
-    *errors, heavy = done.stderr.splitlines()
-    assert heavy == "[]", f"{arguments}: imports {heavy}"
-    return done.returncode, done.stdout, "\n".join(errors)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert len(found) == len(commands)
+    for command, (_, _, _, heavy) in zip(commands, found, strict=True):
+        assert heavy == [], f"{command}: imports {heavy}"
+    return [(code, out, errors.rstrip("\n")) for code, out, errors, _ in found]
 
 
 @pytest.fixture(scope="module")
@@ -61,56 +80,44 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--help"],
-        ["--help-all"],
-        ["run", "--help"],
-        ["train-coarse", "--help-all", "--preset", "paper"],
-        ["eval", "-h"],
-    ],
-)
-def test_help_imports_nothing_heavy(arguments, place):
-    code, out, _ = answer(place, *arguments)
-    assert code == 0
-    assert "usage: vdgs" in out
+def test_help_imports_nothing_heavy(place):
+    asked = (["--help"], ["--help-all"], ["run", "--help"], ["train-coarse", "--help-all", "--preset", "paper"])
+    for code, out, _ in answers_of(place, *asked, ["eval", "-h"]):
+        assert code == 0
+        assert "usage: vdgs" in out
 
 
 def test_no_verb_with_an_input_is_left_out():
     assert set(MISTYPED) == set(COMMANDS) - {"doctor", "synth"}
 
 
-@pytest.mark.parametrize("verb", MISTYPED)
-def test_a_mistyped_path_is_answered_at_once(verb, place):
-    code, _, err = answer(place, verb, *MISTYPED[verb])
-    assert code == 1
-    meant = "flight" if {"fligth", "flihgt"} & set(MISTYPED[verb]) else "DCIM"
-    assert err.endswith(f"; did you mean {meant}?")
+def test_a_mistyped_path_is_answered_at_once(place):
+    answers = answers_of(place, *([verb, *words] for verb, words in MISTYPED.items()))
+    for (verb, words), (code, _, errors) in zip(MISTYPED.items(), answers, strict=True):
+        assert code == 1, verb
+        meant = "flight" if {"fligth", "flihgt"} & set(words) else "DCIM"
+        assert errors.endswith(f"; did you mean {meant}?"), verb
     assert sorted(path.name for path in place.iterdir()) == ["DCIM", "flight"]
 
 
-@pytest.mark.parametrize(
-    "verb", ["eval", "render", "ortho", "export", "visibility", "partition", "train-blocks", "merge", "lod", "report"]
-)
-def test_a_folder_that_is_no_run_is_answered_at_once(verb, place):
-    output = ["-o", "new"] if verb in ("render", "export") else []
-    code, _, err = answer(place, verb, "flight", *output)
-    assert code == 1
-    assert f"flight: {'holds nothing of a run' if verb == 'report' else 'is not a run folder'}" in err
+def test_a_folder_that_is_no_run_is_answered_at_once(place):
+    of_runs = ("eval", "ortho", "visibility", "partition", "train-blocks", "merge", "lod", "report")
+    commands = [[verb, "flight"] for verb in of_runs]
+    commands += [[verb, "flight", "-o", "new"] for verb in ("render", "export")]
+    for (verb, *_), (code, _, errors) in zip(commands, answers_of(place, *commands), strict=True):
+        assert code == 1, verb
+        assert f"flight: {'holds nothing of a run' if verb == 'report' else 'is not a run folder'}" in errors, verb
 
 
 def test_a_finished_run_is_answered_at_once(native_small: NativeRun, tmp_path):
     run = shutil.copytree(native_small.whole, tmp_path / "run")
     vdgs("report", run)
     again = ("run", native_small.capture, "--output", run, "--no-ortho")
-    code, out, _ = answer(tmp_path, *again)
-    assert code == 0
-    assert out.startswith(f"nothing to do: {run} is whole\n")
-    assert "next: " in out
-    code, out, _ = answer(tmp_path, "status", run)
-    assert code == 0
-    assert "next: " in out
+    answers = answers_of(tmp_path, again, ("status", run))
+    assert answers[0][1].startswith(f"nothing to do: {run} is whole\n")
+    for code, out, _ in answers:
+        assert code == 0
+        assert "next: " in out
 
 
 def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeRun, tmp_path):

@@ -132,7 +132,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     assert not (output / "work").exists()
 
 
-@pytest.mark.usefixtures("unestimated")
+@pytest.mark.usefixtures("unestimated", "few_features")
 def test_photographs_that_came_later_are_refused_or_make_the_capture_anew(flight, tmp_path):
     output, card, (*names, late) = tmp_path / "capture", tmp_path / "card", flight.names[:5]
     card.mkdir()

@@ -33,7 +33,7 @@ from vdgs.sfm.workspace import Workspace, call_cancellable
 from vdgs.system.step_progress import read_step
 from vdgs.system.stop_signals import catch_stop_signals
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm"), pytest.mark.usefixtures("few_features")]
 
 
 def console() -> Console:
@@ -161,33 +161,14 @@ STEPS = {
 }
 
 
-@pytest.mark.parametrize("step", STEPS)
-def test_a_signal_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
-    flight, begun, tmp_path, monkeypatch, step
-):
+@pytest.mark.usefixtures("unestimated")
+def test_a_signal_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(flight, tmp_path, monkeypatch):
+    """One command, stopped in every step in turn: each goes on from what the one before it did."""
     monkeypatch.setattr(feature_matching, "PAIRS_PER_THREAD", 4)
     monkeypatch.setattr(incremental_mapper, "MIN_SNAPSHOT_INTERVAL", 2)
-    room, name, after, number = STEPS[step]
-    output, stop, function = tmp_path / "capture", Stopper(after, number), getattr(room, name)
-    if step in begun:
-        copy_folder(begun[step], output)
+    output = tmp_path / "capture"
     request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1)
-
-    def then_stopped(*arguments, **named):
-        result = function(*arguments, **named)
-        stop()
-        return result
-
-    with monkeypatch.context() as patch:
-        patch.setattr(room, name, then_stopped)
-        with pytest.raises(KeyboardInterrupt), catch_stop_signals(interrupts=True):
-            reconstruct(request, console())
-    with pytest.raises(CaptureError, match="is not finished"):
-        load_capture(output)
-    reached = read_step(output / "work" / "progress.json")
-    assert reached is not None
-    assert reached.step == step
-    mapped, extracted, matched = [], [], []
+    extracted, matched, mapped = [], [], []
 
     def counted(called, *arguments, **named):
         if called is pycolmap.extract_features:
@@ -200,18 +181,38 @@ def test_a_signal_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
 
     for each in (feature_extraction, feature_matching, incremental_mapper):
         monkeypatch.setattr(each, "call_cancellable", counted)
+    for step, (room, name, after, number) in STEPS.items():
+        for calls in (extracted, matched, mapped):
+            calls.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(room, name, _then_stopped(getattr(room, name), Stopper(after, number)))
+            with pytest.raises(KeyboardInterrupt), catch_stop_signals(interrupts=True):
+                reconstruct(request, console())
+        with pytest.raises(CaptureError, match="is not finished"):
+            load_capture(output)
+        reached = read_step(output / "work" / "progress.json")
+        assert reached is not None
+        assert reached.step == step
+        assert len(extracted) == {"features": 6, "matching": 4}.get(step, 0)  # the six of three calls are kept
+        assert bool(matched) == (step in ("matching", "mapping"))
+        assert bool(mapped) == (step in ("mapping", "writing"))
+    assert int(Path(mapped[0]).name) >= 4  # mapping went on from what it had
+    for calls in (extracted, matched, mapped):
+        calls.clear()
     written = {path: path.stat().st_mtime_ns for path in output.glob("images*/*.JPG")}
-    facts = reconstruct(request, console())
-    whole_capture(output, flight, facts)
+    assert len(written) >= 8
+    whole_capture(output, flight, reconstruct(request, console()))
     assert all(path.stat().st_mtime_ns == when for path, when in written.items())
-    here = list(STEPS).index(step)
-    assert len(extracted) == (4 if here == 0 else 0)  # the six of three calls are kept
-    assert bool(matched) == (here <= 1)
-    assert bool(mapped) == (here <= 2)
-    if here == 2:  # goes on from what it had
-        assert int(Path(mapped[0]).name) >= 4
-    if here == 3:
-        assert len(written) >= 8
+    assert extracted + matched + mapped == []
+
+
+def _then_stopped(function, stop: Stopper):
+    def called(*arguments, **named):
+        result = function(*arguments, **named)
+        stop()
+        return result
+
+    return called
 
 
 def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path, monkeypatch):
@@ -291,32 +292,35 @@ def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_
     whole_capture(output, flight, reconstruct(request, console()))
 
 
-@pytest.mark.parametrize("step", ["features", "matching"])
-def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight, begun, tmp_path, monkeypatch, step):
-    output, room = tmp_path / "capture", STEPS[step][0]
-    if step in begun:
-        copy_folder(begun[step], output)
-    request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1)
+@pytest.mark.usefixtures("unestimated")
+def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight, tmp_path, monkeypatch):
+    """First for features, then for matches."""
+    request = SfmRequest(image_folders=(flight.folder,), output=tmp_path / "capture", threads=1)
     monkeypatch.setattr(feature_matching, "PAIRS_PER_THREAD", 4)
-
-    def full(function, *arguments, **named):
-        full.calls += 1
-        if full.calls == (2 if room is feature_extraction else 3):
-            return call_cancellable(lambda _, cancellation_token: fail("SQLite error: disk is full"), arguments[0])
-        return call_cancellable(function, *arguments, **named)
+    calls = {feature_extraction: 0, feature_matching: 0}
 
     def fail(why: str):
         raise RuntimeError(why)
 
-    full.calls = 0
-    with monkeypatch.context() as patch:
-        patch.setattr(room, "call_cancellable", full)
-        with pytest.raises(VdgsError, match=r"the disk is full .* the same command then goes on"):
-            reconstruct(request, console())
-    calls, following = [], feature_matching if room is feature_extraction else incremental_mapper
-    monkeypatch.setattr(room, "call_cancellable", lambda *a, **n: (calls.append(a[0]), call_cancellable(*a, **n))[1])
+    def counted(room, full_at=None):
+        def call(function, *arguments, **named):
+            calls[room] += 1
+            if calls[room] == full_at:
+                return call_cancellable(lambda _, cancellation_token: fail("SQLite error: disk is full"), arguments[0])
+            return call_cancellable(function, *arguments, **named)
+
+        return call
+
+    for room, full_at in ((feature_extraction, 2), (feature_matching, 3)):
+        with monkeypatch.context() as patch:
+            patch.setattr(room, "call_cancellable", counted(room, full_at))
+            with pytest.raises(VdgsError, match=r"the disk is full .* the same command then goes on"):
+                reconstruct(request, console())
+        calls[room] = 0
+        monkeypatch.setattr(room, "call_cancellable", counted(room))
     # That they lead to the same model whatever disk was full: test_full_disks.py; a whole capture: the signals above.
-    monkeypatch.setattr(following, "call_cancellable", lambda *_, **__: fail("all of this step is there"))
+    monkeypatch.setattr(incremental_mapper, "call_cancellable", lambda *_, **__: fail("all of this step is there"))
     with pytest.raises(RuntimeError, match="all of this step is there"):
         reconstruct(request, console())
-    assert len(calls) < (5 if room is feature_extraction else 9)  # of five, and nine with the four pairs of each
+    assert calls[feature_extraction] < 5  # of five, and nine with the four pairs of each
+    assert calls[feature_matching] < 9

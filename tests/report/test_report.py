@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from PIL import Image
 from support.report_page import Page
 from vdgs.errors import RunError
 from vdgs.report import charts
-from vdgs.report.embedded_images import EmbeddedImage
+from vdgs.report.embedded_images import EmbeddedImage, load_embedded_image
 from vdgs.report.write_report import write_report
 from vdgs.runs.run_folder import RunFolder
 
@@ -43,10 +45,19 @@ def blank_charts(monkeypatch):
     monkeypatch.setattr(charts, "_to_image", lambda figure: EmbeddedImage(b"", *figure.canvas.get_width_height()))
 
 
-def picture(path: Path, size: tuple[int, int] = (60, 40), noise: bool = False) -> None:
+@cache
+def png(noise: bool) -> bytes:
+    """A large picture of noise, or a small one of one color."""
+    pixels = np.random.default_rng(0).integers(0, 256, (700, 1000, 3), dtype=np.uint8) if noise else None
+    content = io.BytesIO()
+    image = Image.new("RGB", (60, 40), "teal") if pixels is None else Image.fromarray(pixels)
+    image.save(content, "PNG", compress_level=1)
+    return content.getvalue()
+
+
+def picture(path: Path, noise: bool = False) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8) if noise else None
-    (Image.new("RGB", size, "teal") if pixels is None else Image.fromarray(pixels)).save(path, compress_level=1)
+    path.write_bytes(png(noise))
 
 
 def write(path: Path, content: object) -> None:
@@ -153,10 +164,9 @@ def whole_run(root: Path, name: str = "meadow", noise: bool = False) -> RunFolde
         "blocks": [{"block": 0, **figures}, {"block": 1, **figures}], "all": figures,
         "seams": {"border_px": 10.0, "border_pixels": 77, "seam_mae_ratio": 1.0625, "seam_mse_ratio": 1.125},
         "views": [{"name": "first.jpg", "border_pixels": 40}]})  # fmt: skip
-    size = (1000, 700) if noise else (60, 40)
     names = [f"evaluation/comparisons/{name}.png" for name in ("first", "second", "third")]
     for file in (*PICTURES, *names, "evaluation/seams/first.png"):
-        picture(root / file, size, noise)
+        picture(root / file, noise)
     return run
 
 
@@ -193,9 +203,11 @@ def test_the_report_of_a_whole_run_holds_its_figures(whole):
 
 @pytest.mark.usefixtures("blank_charts")
 def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
-    run = whole_run(tmp_path / "run")
+    run = coarse_run(tmp_path / "run")
     page = tmp_path / "my place&co.html"
     page.write_text("<html></html>")
+    write(run.path / "merged/status.json", {"state": "done"})
+    write(run.path / "evaluation/metrics.json", metrics(28.375, "merged"))
     run.merged.key_file.write_text("a key")
     record = {"model": "merged", "key": "a key", "files": [{"file": str(page), "bytes": 7_100_000}]}
     write(run.path / "export.json", record)
@@ -292,9 +304,10 @@ def test_an_empty_folder_gives_a_report_and_none_an_error(tmp_path):
 
 @pytest.mark.usefixtures("blank_charts")
 def test_the_report_tells_what_training_began_with(tmp_path):
-    run = whole_run(tmp_path / "run")
-    assert "starts from 2,000 sparse points and 12,757 that stereo found" in Page(write_report(run)).text()
-    assert "differ in brightness by 2.9 %. Each has an exposure" in Page(write_report(run)).text()
+    run = coarse_run(tmp_path / "run")
+    text = Page(write_report(run)).text()
+    assert "starts from 2,000 sparse points and 12,757 that stereo found" in text
+    assert "differ in brightness by 2.9 %. Each has an exposure" in text
     alike = {"sparse_points": 90, "dense_points": None, "brightness_differs": 0.004, "exposures": False}
     write(run.path / "coarse/initialization.json", alike)
     text = Page(write_report(run)).text()
@@ -321,6 +334,7 @@ def test_damaged_files_are_named_and_the_rest_stands(tmp_path, damage):
                 assert file in text, file
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_one_damaged_file_leaves_the_other_sections_alone(tmp_path):
     run = whole_run(tmp_path / "run")
     (run.path / "evaluation/per_view.json").write_text("[{")
@@ -356,6 +370,7 @@ def _replaced(content, value):
     return value
 
 
+@pytest.mark.usefixtures("blank_charts")
 def test_hostile_names_stay_text(tmp_path):
     evil = "<script>alert('x')</script>\"&<img src=https://e.example/x.png>\x00\ud800"
     run = whole_run(tmp_path / "run", name=evil.replace("/", "|"))
@@ -385,6 +400,15 @@ def test_nothing_is_loaded_from_elsewhere(whole):
 
 def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path, monkeypatch):
     monkeypatch.setattr(charts, "DPI", FULL_DPI)
+    reduced = dict[bytes, EmbeddedImage]()  # all large pictures are the same: one is reduced, each is embedded
+
+    def load_once(path: Path) -> EmbeddedImage:
+        content = path.read_bytes()
+        if content not in reduced:
+            reduced[content] = load_embedded_image(path)
+        return reduced[content]
+
+    monkeypatch.setattr("vdgs.report.run_reader.load_embedded_image", load_once)
     run = whole_run(tmp_path / "run", noise=True)
     names = tuple(f"{index:03d}.jpg" for index in range(150))
     write(run.path / "evaluation/per_view.json", views(20.0, names))

@@ -78,11 +78,11 @@ def command(*arguments: object) -> None:
 def test_one_run_reads_its_capture_once_and_each_block_once(tmp_path, reads, monkeypatch, smaller):
     """Also where the run takes a smaller size of the photographs than the capture has."""
     write_colmap(tmp_path / "capture", tiny_scene())
+    monkeypatch.setattr(time_estimate, "MAX_TIMED_SECONDS", 0.0)
     if smaller:
         monkeypatch.setattr(image_size, "MIN_SIDE", 1)
         monkeypatch.setattr(image_size, "MAX_SECONDS", 0.0)
         monkeypatch.setattr(image_size, "DOWNSCALES", (1, 2))
-        monkeypatch.setattr(time_estimate, "MAX_TIMED_SECONDS", 0.0)
     command("run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS)
     assert reads.captures == {"driver": 1, "block 00": 1, "block 01": 1}
     assert (RunFolder(tmp_path / "run").settings().capture.downscale > 1) == smaller

@@ -102,7 +102,7 @@ def test_a_walk_with_panoramas_is_placed(tmp_path):
     places = [np.array([x, y, 12.0 + z]) for x, y, z in [(-7, -3, 0), (0, -3, 1), (7, -3, 0), (3, 4, 1)]]
     headings = walk(tmp_path / "photos", places, WIDTH)
     output = tmp_path / "capture"
-    options = SfmOptions(max_num_features=1500)
+    options = SfmOptions(max_num_features=700)
     request = SfmRequest(image_folders=(tmp_path / "photos",), output=output, threads=1, options=options)
     report = reconstruct(request, Console(file=io.StringIO()))
     assert report.reprojection_px < 0.6

@@ -102,6 +102,7 @@ def test_points_lie_on_the_ground_and_poses_stay(town_flight: tuple[Path, KnownF
     assert "nothing to do" in ask(root, tmp_path / "capture")
 
 
+@pytest.mark.usefixtures("few_features")
 def test_report_of_odm_becomes_a_capture_that_has_its_place(
     town_flight: tuple[Path, KnownFlight], tmp_path: Path
 ) -> None:
@@ -130,6 +131,7 @@ def test_report_of_odm_becomes_a_capture_that_has_its_place(
         ask(root, tmp_path / "capture")
 
 
+@pytest.mark.usefixtures("few_features")
 def test_run_of_a_project_without_points_finds_them_first(
     town_flight: tuple[Path, KnownFlight], tmp_path: Path
 ) -> None:
@@ -198,6 +200,7 @@ def _stop(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.usefixtures("few_features")
 def test_photographs_of_other_poses_are_refused(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
     root, flight = _some_photographs(town_flight, tmp_path)
     project_writers.write_realityscan_csv(root / "cameras.csv", replace(flight, names=flight.names[::-1]))
@@ -243,6 +246,7 @@ def test_transforms_without_points_keep_their_poses_and_lists(
     assert len(every.trained) == 7
 
 
+@pytest.mark.usefixtures("few_features")
 def test_a_set_of_blender_is_put_on_white(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
     root, flight = town_flight
     for side, indices in (("train", range(4)), ("test", range(4, 6))):

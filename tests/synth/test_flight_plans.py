@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.xdist_group("synth_flights"), pytest.mark.slow]
 
 FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor", "heights")
 TOY = SynthOptions(
-    size="toy", width=64, height=48, samples_per_pixel=1, num_points=300, seed=1, truth=True,
+    size="toy", width=64, height=48, samples_per_pixel=1, num_points=300, seed=5, extent_m=120.0, truth=True,
     num_images=12, num_test_images=2, num_validation_images=2,
 )  # fmt: skip
 
@@ -52,9 +52,13 @@ def tracer(town: Town) -> RayTracer:
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture(town: Town, tracer: RayTracer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toy") / "capture"
-    generate(folder, replace(TOY, exposure_stops=0.3, outlier_fraction=0.1, pose_noise_px=0.5))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vdgs.synth.generation.build_town", lambda seed, extent_m, pond_within: town)
+        patch.setattr("vdgs.synth.generation.RayTracer", lambda mesh: tracer)
+        patch.setattr("vdgs.synth.lighting._CELL", 4.0)  # how bright the ground is does not matter here
+        generate(folder, replace(TOY, exposure_stops=0.3, outlier_fraction=0.1, pose_noise_px=0.5))
     return folder
 
 
@@ -66,10 +70,12 @@ def options_of(flight: str, images: int = 60, **more: object) -> ResolvedOptions
 def seen(town: Town, tracer: RayTracer) -> dict[str, tuple[list[Camera], np.ndarray, np.ndarray]]:
     """Of each flight: its cameras, places that they see, and how many of them see each."""
     found = {}
-    for flight in FLIGHTS:
-        cameras = make_flight_cameras(options_of(flight, width=64, height=48), town)
-        places, views = sample_visible_points(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
-        found[flight] = (cameras, places, views)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vdgs.synth.true_visibility._NUM_POINTS", 12_000)
+        for flight in FLIGHTS:
+            cameras = make_flight_cameras(options_of(flight, width=64, height=48), town)
+            places, views = sample_visible_points(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
+            found[flight] = (cameras, places, views)
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,16 +50,30 @@ TINY = SynthOptions(
 )  # fmt: skip
 
 
+@pytest.fixture(scope="module", autouse=True)
+def coarse_sky_map() -> Iterator[None]:
+    """Cells of a meter, as on large maps: rays into the sky would take longer than all else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vdgs.synth.lighting._CELL", 1.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def town() -> Town:
     return build_town(TINY.seed, TINY.extent_m)
 
 
 @pytest.fixture(scope="module")
-def capture(town: Town, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tracer(town: Town) -> RayTracer:
+    return RayTracer(town.mesh)
+
+
+@pytest.fixture(scope="module")
+def capture(town: Town, tracer: RayTracer, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("synth") / "capture"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vdgs.synth.generation.build_town", lambda seed, extent_m, pond_within: town)
+        patch.setattr("vdgs.synth.generation.RayTracer", lambda mesh: tracer)
         generate(folder, TINY)
     return folder
 
@@ -319,7 +334,7 @@ def test_plan_coordinates_invert() -> None:
     np.testing.assert_allclose(back, (p, q), atol=1e-4)
 
 
-def test_every_seed_gives_a_town_of_its_own(town: Town, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_seed_gives_a_town_of_its_own(town: Town, tracer: RayTracer, monkeypatch: pytest.MonkeyPatch) -> None:
     towns = [town, build_town(1, TINY.extent_m, pond_within=True)]
     assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
     for town in towns:
@@ -330,15 +345,15 @@ def test_every_seed_gives_a_town_of_its_own(town: Town, monkeypatch: pytest.Monk
         assert town.mesh.faces.max() < len(town.mesh.vertices)
     away = [np.hypot(each.terrain.ponds[0].x, each.terrain.ponds[0].y) for each in towns]
     assert away[1] < 40 < away[0]  # metres; blocks are 42 apart
-    tracer, things = RayTracer(towns[0].mesh), make_moving_objects(towns[0], 12, seed=0)
+    things = make_moving_objects(towns[0], 12, seed=0)
     monkeypatch.setattr("vdgs.synth.moving_objects.RayTracer", lambda mesh: tracer)  # takes long, and nobody asks it
     meshes = [place_moving_objects(towns[0], tracer, things, 0, photograph)[0].mesh for photograph in (3, 3, 4)]
     np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
     assert not np.array_equal(meshes[0].vertices, meshes[2].vertices)
 
 
-def test_waves_change_what_water_mirrors_and_nothing_else(town: Town) -> None:
-    pond, tracer = town.terrain.ponds[0], RayTracer(town.mesh)
+def test_waves_change_what_water_mirrors_and_nothing_else(town: Town, tracer: RayTracer) -> None:
+    pond = town.terrain.ponds[0]
     x, y = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-2, 2, 40)] * 2))
     origins = np.stack([pond.x + pond.rx * x, pond.y + pond.ry * y, np.full(1600, 60.0)], 1).astype(np.float32)
     down = np.broadcast_to(np.float32([-0.2, -0.2, -0.96]), origins.shape)
