@@ -32,7 +32,7 @@ BUSY = DensityConfig(interval=2, start=1, until=1.0, threshold=1e-9, reset_inter
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("place") / "capture"
-    write_colmap(folder, tiny_scene(points=60, width=24, height=18))
+    write_colmap(folder, tiny_scene(columns=3, rows=2, points=60, width=24, height=18))
     return load_capture(folder, CaptureOptions(up="z"))
 
 

@@ -83,23 +83,23 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
 def test_what_stereo_found_is_kept_and_looked_for_once(tmp_path):
     capture, run = tmp_path / "capture", tmp_path / "run"
     write_colmap(capture, tiny_scene(points=80))
-    assert STEREO in finish(capture, run, "--iterations", "30").stdout
+    assert STEREO in finish(capture, run, "--iterations", "10").stdout
     file, before = run / "coarse/stereo.safetensors", model_bytes(run)
     found = read_tensors(file)[0]["points"].numpy()
     assert np.abs(found[:, 2]).max() < 1.5  # of a camera height of ten: the ground is flat
     kept = file.stat().st_mtime_ns
     (run / "coarse/model.safetensors").unlink()
-    assert finish(capture, run, "--iterations", "30").returncode == 0
+    assert finish(capture, run, "--iterations", "10").returncode == 0
     assert file.stat().st_mtime_ns == kept
     assert model_bytes(run) == before
     (run / "coarse/model.safetensors").unlink()
     file.write_bytes(file.read_bytes()[:-8])
-    broken = finish(capture, run, "--iterations", "30")
+    broken = finish(capture, run, "--iterations", "10")
     assert broken.returncode == 1
     assert str(file) in broken.stderr
     assert "Delete it" in broken.stderr
     file.unlink()
-    assert finish(capture, run, "--iterations", "30").returncode == 0
+    assert finish(capture, run, "--iterations", "10").returncode == 0
     assert np.array_equal(read_tensors(file)[0]["points"].numpy(), found)
 
 
@@ -142,22 +142,31 @@ def take_terminal(name: str) -> None:
     os.dup2(os.open(name, os.O_RDWR), 2)
 
 
-@pytest.mark.parametrize("how", [*STOP_SIGNALS, "terminal closes"])
-def test_a_stopped_run_saves_and_continues(capture, unbroken, tmp_path, how):
-    run, (inside, outside) = tmp_path / "run", os.openpty()
-    prepare = None if isinstance(how, signal.Signals) else partial(take_terminal, os.ttyname(outside))
-    with begun(*command(capture, run), pause_at=("*/checkpoints/00000020.json", 1), prepare=prepare) as process:
+def stop(arguments: list[str], iteration: int, how: signal.Signals | None) -> CompletedProcess[str]:
+    """Stop a run that is about to save: by a signal, or because its terminal closes."""
+    inside, outside = os.openpty()
+    prepare = None if how else partial(take_terminal, os.ttyname(outside))
+    with begun(*arguments, pause_at=(f"*/checkpoints/{iteration:08d}.json", 1), prepare=prepare) as process:
         process.wait_until_paused()
-        if isinstance(how, signal.Signals):
+        if how:
             process.send_signal(how)
         os.close(outside)
         os.close(inside)
-        stopped = process.finished()
-    assert stopped.returncode == 130
-    assert ("The same command continues" in stopped.stderr) == isinstance(how, signal.Signals)
-    assert json.loads((run / "coarse/status.json").read_text())["state"] == "stopped"
+        return process.finished()
+
+
+def test_a_stopped_run_saves_and_continues(capture, unbroken, tmp_path):
+    """By each signal, and last as its terminal closes: four times over, and to the same bits."""
+    run = tmp_path / "run"
+    for iteration, how in zip((20, 40, 60, 80), (*STOP_SIGNALS, None), strict=True):
+        stopped = stop(command(capture, run), iteration, how)
+        assert stopped.returncode == 130, how
+        assert ("The same command continues" in stopped.stderr) == (how is not None)
+        status = json.loads((run / "coarse/status.json").read_text())
+        assert (status["state"], status["iteration"]) == ("stopped", iteration)
+        assert iteration == 20 or f"continuing at iteration {iteration - 20}" in stopped.stdout
     done = finish(capture, run)
-    assert "continuing at iteration 20" in done.stdout
+    assert "continuing at iteration 80" in done.stdout
     assert model_bytes(run) == model_bytes(unbroken)
 
 
