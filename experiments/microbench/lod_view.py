@@ -240,7 +240,7 @@ def draw_cut(scene: LodScene, camera: Camera, cut: LodCut) -> Raster:
 def compare(name: str, shown: np.ndarray, tree: LodScene, camera: Camera, pixel: float, samples: int) -> None:
     """Print what a picture at rest lacks."""
     at_rest = tree.at_error(REST_ERROR_PX).within(camera, REST_MAX_COST)
-    every = tree.in_detail(PART_CACHE_BYTES)
+    every = tree.in_detail(tree.tree.with_own_cache(PART_CACHE_BYTES))
     exact, aliased = (full_detail(each, camera, 1) for each in (every.without_aliasing(pixel), every))
     fine = full_detail(every, camera, samples)
     print(

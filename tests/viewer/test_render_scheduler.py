@@ -246,6 +246,25 @@ def test_who_rests_gets_full_detail_part_by_part_until_a_move(studio):
     assert [frame.image.mean() for frame in again[1] if frame.is_full] == [1]  # what others waited for is there
 
 
+def test_a_part_that_could_not_be_drawn_is_drawn_for_the_next(studio):
+    studio, clock = studio
+
+    class Fails(Detailed):
+        def paint(self, *args, full_detail=False, **named):
+            if full_detail:
+                raise RuntimeError("no part")
+            return super().paint(*args, **named)
+
+    for painter, share, said in ((Fails(clock, 2e-6), 0, ["no part"]), (Detailed(clock, 2e-6), 1, [])):
+        seat, frames, errors = sit(studio, painter)
+        studio.request_frame(seat, camera_at(0, 0, width=1280), DisplayOptions())
+        clock.now += REST_SECONDS
+        while studio.step() == 0:
+            pass
+        assert frames[-1].image.mean() == share
+        assert [str(error) for error in errors] == said
+
+
 def test_visitors_take_turns_and_moving_ones_go_first(studio):
     studio, clock = studio
     order: list[int] = []

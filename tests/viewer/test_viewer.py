@@ -102,6 +102,10 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
         exact = painter.paint(display, camera, camera, full_detail=True)
         assert np.array_equal(draw_parts(painter, display, camera, parts), exact)  # the parts are all of it, each once
     assert tree.tree.cached_bytes == kept  # what pictures of a moving camera need stays in memory
+    for visible in (1, 2, 3, 1, 2, 3):  # visitors share what was read of leaves, whatever fades out for each
+        painter.paint(DisplayOptions(min_visibility=visible), parts[0], camera, full_detail=True)
+    assert len(seen._detailed_trees) == 1
+    assert len({id(seen._faded_tree("merged", visible)) for visible in (1, 2, 3, 1, 2, 3)}) == 3
     near = pick_position(seen.shown("merged"), camera, 32.5, 20.5)
     assert near is not None
     assert np.linalg.norm(near - pick_position(model, camera, 32.5, 20.5)) < 0.3

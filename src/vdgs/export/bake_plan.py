@@ -153,5 +153,5 @@ def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
         request.block,
         box,
         crs,
-        *([request.min_visibility] if request.min_visibility else []),
+        *([f"fades out below {request.min_visibility}"] if request.min_visibility else []),
     ]

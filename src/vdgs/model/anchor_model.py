@@ -88,8 +88,8 @@ class AnchorModel:
         return replace(self, anchors=self.anchors.select(none))  # copies: slices would keep the tensors in memory
 
     def save(self, path: Path) -> None:
-        """Write one safetensors file, atomically."""
-        tensors = {f"anchors.{k}": v for k, v in self.anchors.tensors().items()}
+        """Write one safetensors file, atomically; without factors of opacities (`Anchors.opacity_factors`)."""
+        tensors = {f"anchors.{k}": v for k, v in replace(self.anchors, opacity_factors=None).tensors().items()}
         for prefix, decoder in self._decoders():
             tensors |= {prefix + name: tensor for name, tensor in decoder.tensors().items()}
         content: dict[str, object] = {

@@ -66,10 +66,9 @@ class LodScene:
         """The same scene, coarser where a view would cost more than so many merged Gaussians."""
         return self.at_error(self.tree.error_within(camera, self.max_error_px, max_cost))
 
-    def in_detail(self, cache_bytes: int) -> LodScene:
-        """The same scene drawn from all anchors, for small parts of views, with memory of its own: what this one keeps
-        stays there."""
-        tree = self.tree.with_own_cache(cache_bytes)
+    def in_detail(self, tree: LodTree) -> LodScene:
+        """The same scene drawn from all anchors, for small parts of views, through its tree with memory of its own
+        (`LodTree.with_own_cache`): what this one keeps stays there."""
         return replace(self, tree=tree, max_error_px=0.0, view=None, culls_leaves=True, _anchors={}, _gaussians={})
 
     def for_view(self, view: Camera) -> LodScene:
@@ -132,15 +131,18 @@ class LodScene:
         rows, found = list[Tensor](), list[Tensor]()
         for leaf in leaves:
             anchors, these = self.tree.anchors(leaf)
-            values, mask = of(("anchors", leaf), anchors.positions), self._leaf_mask(leaf, camera)
+            values = of(("anchors", leaf), anchors.positions)
+            mask = self._leaf_mask(anchors, self._leaf_factors(leaf, anchors), camera)
             rows.append(these if mask is None else these[mask])
             found.append(values if mask is None else values[mask])
         return torch.cat(found)[torch.cat(rows).argsort()]
 
-    def _leaf_mask(self, leaf: int, camera: Camera) -> Tensor | None:
+    def _leaf_factors(self, leaf: int, anchors: Anchors) -> Tensor | None:
+        return None if self.fade is None else self.fade(("anchors", leaf), anchors.positions)
+
+    def _leaf_mask(self, anchors: Anchors, factors: Tensor | None, camera: Camera) -> Tensor | None:
         """Which anchors of a leaf are put together for a view; None: all."""
-        anchors, _ = self.tree.anchors(leaf)
-        mask = None if self.fade is None else self.fade(("anchors", leaf), anchors.positions) > 0
+        mask = None if factors is None else factors > 0
         if self.culls_leaves:
             seen = torch.zeros(len(anchors), dtype=torch.bool)
             seen[cull_anchors(anchors, replace(camera, photograph_pixel=self.model.photograph_pixel))] = True
@@ -161,14 +163,17 @@ class LodScene:
 
     def _assemble_anchors(self, leaves: tuple[int, ...], camera: Camera) -> AnchorModel | None:
         """The anchors of some leaves that are drawn, in the order of the model, each with its decoder."""
-        found = self.tree.anchors_of(leaves, lambda leaf: self._leaf_mask(leaf, camera))
-        if found is None:
-            return None
-        anchors, rows = found
-        if self.fade is not None:
-            factors = self._leaf_values(leaves, camera, self.fade)
+        found = self.tree.anchors_of(leaves, partial(self._drawn_anchors, camera=camera))
+        return None if found is None else model_of_rows(self.model, *found).to(self.device)
+
+    def _drawn_anchors(self, leaf: int, camera: Camera) -> tuple[Anchors, Tensor]:
+        """The anchors of a leaf that are put together for a view, faded, and their rows in the model."""
+        anchors, rows = self.tree.anchors(leaf)
+        factors = self._leaf_factors(leaf, anchors)
+        mask = self._leaf_mask(anchors, factors, camera)
+        if factors is not None:
             anchors = replace(anchors, opacity_factors=factors.to(anchors.positions))
-        return model_of_rows(self.model, anchors, rows).to(self.device)
+        return (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
 
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> Gaussians | None:
         """The merged Gaussians of some nodes that are drawn."""

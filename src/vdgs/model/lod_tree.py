@@ -166,15 +166,10 @@ class LodTree:
         return _joined(Gaussians, parts) if parts else None
 
     def anchors_of(
-        self, leaves: tuple[int, ...], mask_of: Callable[[int], Tensor | None]
+        self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]
     ) -> tuple[Anchors, Tensor] | None:
-        """The anchors of some leaves in the order of the model, and their rows there; of each those in its mask."""
-        parts = [self.anchors(leaf) for leaf in leaves]
-        masks = [mask_of(leaf) for leaf in leaves]
-        parts = [
-            (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
-            for (anchors, rows), mask in zip(parts, masks, strict=True)
-        ]
+        """The anchors of some leaves in the order of the model, and their rows there; of each leaf those of `drawn`."""
+        parts = [drawn(leaf) for leaf in leaves]
         if not parts:
             return None
         rows, order = torch.cat([rows for _, rows in parts]).sort()

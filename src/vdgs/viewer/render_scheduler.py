@@ -324,10 +324,11 @@ class RenderScheduler:
         while full.parts or left:
             yield
             if full.parts:
-                part = full.parts.popleft()
+                part = full.parts[0]
                 x, y = round(full_camera.cx - part.cx), round(full_camera.cy - part.cy)
                 drawn = session.painter.paint(display, part, full_camera, full_detail=True)
                 full.image[y : y + part.height, x : x + part.width] = drawn
+                full.parts.popleft()  # only now: one that could not be drawn stays due
             if session.requested != (full_camera, display):
                 return
             if not full.parts or self._clock() - sent_at >= DETAIL_SECONDS:

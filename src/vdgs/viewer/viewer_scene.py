@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from vdgs.geometry.map_projection import MapProjection
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.lod_scene import LodScene, NodeContent
-from vdgs.model.lod_tree import ANCHOR_COST
+from vdgs.model.lod_tree import ANCHOR_COST, LodTree
 from vdgs.model.renderer import Drawable, render
 from vdgs.partition.blocks import Blocks, xy_positions
 from vdgs.runs.lod_folder import find_tree
@@ -38,11 +38,16 @@ REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 2_000_000
 #: A view at rest is then drawn from all anchors, in parts that show about so many: a part takes about 50 ms on two
 #: cores (measured). Leaves take so much memory meanwhile.
 PART_MAX_ANCHORS, PART_CACHE_BYTES = 20_000, 256 << 20
+#: Visitors may let a scene fade out at different V: of so many, what has faded is kept (choice).
+_MAX_FADED = 3
 #: Photographs kept in memory, decoded (choice).
 _IMAGE_CACHE_BYTES = 128 << 20
 #: What a camera meters is drawn from at most about so many anchors (choice): fitting its law takes up to two hundred
 #: images, and all clients wait meanwhile.
 _METERING_MAX_ANCHORS = 10_000
+
+_Key = TypeVar("_Key")
+_Kept = TypeVar("_Kept")
 
 
 class ViewerScene:
@@ -55,13 +60,13 @@ class ViewerScene:
         self._runs: dict[str, OpenedRun] = {run.name: run}
         self._visibility: dict[str, Tensor] = {}
         self._block_tints: dict[str, Tensor] = {}
-        #: By model, and by how many cameras must see an anchor; of each model the last such number beside 0.
+        #: By model, and by how many cameras must see an anchor; of each model the last few such numbers.
         self._levels: dict[str, dict[int, LodPyramid]] = {}
         self._trees: dict[str, LodScene | None] = {}
-        #: The last that was asked for.
+        #: By the same two, the last few that were asked for.
         self._faded_trees: dict[tuple[str, int], LodScene] = {}
-        #: Trees that draw all anchors, by the same key.
-        self._detailed_trees: dict[tuple[str, int], LodScene] = {}
+        #: By model, for pictures from all anchors.
+        self._detailed_trees: dict[str, LodTree] = {}
         self._values: dict[tuple[str, NodeContent], Tensor] = {}
         self._exposures: dict[str, ViewExposures | None] = {}
         #: Grows with every newer model.
@@ -109,7 +114,7 @@ class ViewerScene:
         if tree is None:
             return self._pyramid(name, min_visibility).of(camera, max_anchors)
         if full_detail:
-            tree = self._detailed(name, min_visibility, tree)
+            tree = tree.in_detail(self._detailed_tree(name, tree.tree))
         else:
             least = REST_ERROR_PX if max_anchors is None else PREVIEW_ERROR_PX
             cost = REST_MAX_COST if max_anchors is None else max_anchors * ANCHOR_COST
@@ -123,25 +128,30 @@ class ViewerScene:
         tree = self._faded_tree(name, min_visibility)
         return [] if tree is None else tree.tree.parts_in_detail(camera, PART_MAX_ANCHORS)
 
-    def _detailed(self, name: str, min_visibility: int, tree: LodScene) -> LodScene:
-        """A tree that draws all anchors."""
-        key = (name, min_visibility)
-        if key not in self._detailed_trees:
-            self._detailed_trees = {key: tree.in_detail(PART_CACHE_BYTES)}
-        return self._detailed_trees[key]
+    def _detailed_tree(self, name: str, tree: LodTree) -> LodTree:
+        """The tree of a model with memory for pictures from all anchors, whatever fades out."""
+        if name not in self._detailed_trees:
+            self._detailed_trees[name] = tree.with_own_cache(PART_CACHE_BYTES)
+        return self._detailed_trees[name]
 
     def _faded_tree(self, name: str, min_visibility: int) -> LodScene | None:
         """The tree of a model that fades out where fewer than so many training cameras see; None where it has none."""
         tree = self.tree(name)
         if tree is None or not min_visibility:
             return tree
-        if (name, min_visibility) not in self._faded_trees:
+
+        def fade_out() -> LodScene:
             least = min(min_visibility, int(self.visibility_sample(name).max()))
-            self._faded_trees.clear()
-            self._faded_trees[name, min_visibility] = tree.with_fade(
-                partial(self._node_values, f"{name} fade {least}", partial(self._count_fade, least))
-            )
-        return self._faded_trees[name, min_visibility]
+            held: dict[NodeContent, Tensor] = {}  # gone with the tree
+
+            def factors(content: NodeContent, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+                if content not in held:
+                    held[content] = self._count_fade(least, places)
+                return held[content]
+
+            return tree.with_fade(factors)
+
+        return _keep_last(self._faded_trees, (name, min_visibility), fade_out)
 
     def _count_fade(self, min_visibility: int, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         cameras = self._nearby.of(places)
@@ -150,10 +160,7 @@ class ViewerScene:
     def _pyramid(self, name: str, min_visibility: int) -> LodPyramid:
         """The levels of a model without a tree."""
         pyramids = self._levels.setdefault(name, {})
-        if min_visibility not in pyramids:
-            whole = {0: pyramids[0]} if 0 in pyramids else {}
-            pyramids = self._levels[name] = whole | {min_visibility: LodPyramid(self._faded(name, min_visibility))}
-        return pyramids[min_visibility]
+        return _keep_last(pyramids, min_visibility, lambda: LodPyramid(self._faded(name, min_visibility)))
 
     def _faded(self, name: str, min_visibility: int) -> AnchorModel:
         """A model that fades out where fewer than so many training cameras see, or fewer than see any of it."""
@@ -186,7 +193,9 @@ class ViewerScene:
     def visibility_sample(self, name: str) -> Float[Tensor, " n"]:
         """V all over a model: of every anchor, or of the root of its tree."""
         tree = self.tree(name)
-        return self.visibility(name) if tree is None else self._count_visibility(tree.tree.gaussians(0).means)
+        if tree is None:
+            return self.visibility(name)
+        return self._node_values(f"{name} V", self._count_visibility, ("nodes", 0), tree.tree.gaussians(0).means)
 
     def _node_values(
         self, what: str, of: Callable[[Tensor], Tensor], content: NodeContent, places: Float[Tensor, "p 3"]
@@ -268,6 +277,15 @@ class ViewerScene:
     def close(self) -> None:
         if "images" in self.__dict__:
             self.images.close()
+
+
+def _keep_last(kept: dict[_Key, _Kept], key: _Key, make: Callable[[], _Kept]) -> _Kept:
+    """What is kept by a key, or is made: of the last `_MAX_FADED` keys."""
+    found = kept.pop(key) if key in kept else make()
+    while len(kept) >= _MAX_FADED:
+        del kept[next(iter(kept))]
+    kept[key] = found
+    return found
 
 
 def block_rgb(block: int) -> tuple[int, int, int]:

@@ -215,7 +215,8 @@ def _trust_box(gaussians: Gaussians, page: InitialView) -> str:
     few = (page.count_visibility(gaussians.means).clamp(1, 3) - 1).to(torch.uint8).numpy()
     fours = np.concatenate([few, np.zeros(-len(few) % 4, np.uint8)]).reshape(-1, 4)
     packed = base64.b64encode(zlib.compress((fours << np.arange(0, 8, 2, dtype=np.uint8)).sum(1, dtype=np.uint8), 9))
-    return _TRUST_BOX.read_text().replace("$SEEN", packed.decode("ascii")).replace("$COUNT", str(len(few)))
+    box = _TRUST_BOX.read_text(encoding="utf-8")
+    return box.replace("$SEEN", packed.decode("ascii")).replace("$COUNT", str(len(few)))
 
 
 def _client_html() -> str:
