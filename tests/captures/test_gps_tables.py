@@ -157,8 +157,9 @@ def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
     file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,-33.5{k},-70.6,\n" for k in range(4)))
     assert all(math.isnan(row.position[2]) for row in read_gps_table(file).rows)
     rasters = tmp_path / "rasters.csv"
-    rasters.write_text(file.read_text().replace("-70.6,", "-70.6,-9999"))
-    assert all(math.isnan(row.position[2]) for row in read_gps_table(rasters).rows)
+    for unit in (" [ft]", ""):
+        rasters.write_text(file.read_text().replace("-70.6,", "-70.6,-9999").replace("alt", f"alt{unit}"))
+        assert all(math.isnan(row.position[2]) for row in read_gps_table(rasters).rows)
     found = read_gps_priors(seen, file, (1.0, 2.0))
     assert len(found) == 4
     for latitude, says in ((-33.5, False), (-34.5, True)):

@@ -34,6 +34,7 @@ from vdgs.evaluation.comparison_images import Thumbnail
 from vdgs.evaluation.depth_errors import DepthErrors
 from vdgs.evaluation.view_metrics import ViewMetrics
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
+from vdgs.kernels.device_selection import AnyCard
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import lock_folder
@@ -223,8 +224,9 @@ def test_shards_are_given_to_the_cards_in_turn(tmp_path):
     commands = job._commands([1, 4, 5], share, ("cuda:0", "cuda:1"), "cuda:0")
     cards = ["cuda:0", "cuda:1", "cuda:0"]
     assert [each.command[-1] for each in commands] == [each.resources.device for each in commands] == cards
-    (alone,) = job._commands([1], share, (), "cpu")
-    assert (alone.command[-1], alone.resources) == ("cpu", share.resources)
+    for device, on in (("cpu", "cpu"), ("cuda:1", "cuda:1"), (AnyCard("cuda:1"), "cuda")):
+        (alone,) = job._commands([1], share, (), device)
+        assert (alone.command[-1], alone.resources) == (on, share.resources)
 
 
 def test_a_shard_refuses_what_it_was_not_made_for(tmp_path, halves):

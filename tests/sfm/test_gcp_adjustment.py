@@ -24,7 +24,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.sfm import incremental_mapper
-from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
+from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
@@ -171,6 +171,14 @@ def test_heights_that_are_not_known_are_told_from_zeros(flight, tmp_path):
         found = read_gcp_list(file, collection, ())
         assert said in "".join(found.notes)
         assert found.has_heights is (z == "0")
+
+
+def test_heights_of_some_points_make_no_plane_of_a_line():
+    line, nan = np.array([[10.0 * k, 5.0 * k, 0.0] for k in range(5)]), np.nan
+    assert are_along_line(line)
+    assert are_along_line(np.column_stack([line[:, :2], [0, 30, nan, nan, nan]]))
+    assert not are_along_line(np.column_stack([line[:, :2], [0, 30, 0, nan, nan]]))  # a wall
+    assert not are_along_line(np.array([[0, 0, nan], [10, 0, nan], [0, 10, nan]]))
 
 
 BAD = {

@@ -13,10 +13,10 @@ from support.flights import write_photograph
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked
-from vdgs.sfm.exif_gps import FLAT, VOID
+from vdgs.sfm.exif_gps import FLAT, VOID, is_measured_in_xmp
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
-from vdgs.sfm.image_metadata import ImageMetadata, read_image_metadata
+from vdgs.sfm.image_metadata import ImageMetadata, attitude_from_gimbal, read_image_metadata
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.map_datums import to_wgs84
 
@@ -83,10 +83,17 @@ def test_photographs_that_merely_are_dense_stay(first):
     assert unused_exposures(shots(first, [0, 0, 0, -0.3, -0.3, -0.3], each=6))[0] == {}  # the pilot chose another
     assert unused_exposures(shots(first, [0, -1, 1] * 3, step_m=8.0))[0] == {}
     assert unused_exposures(shots(first, [0, -1, 1] * 3, every_s=5))[0] == {}
+    turning = [
+        replace(p, attitude=attitude_from_gimbal(30.0 * k, -60, 0)) for k, p in enumerate(shots(first, [0, -1, 1]))
+    ]
+    assert unused_exposures(turning)[0] == {}
+    assert len(unused_exposures([replace(p, attitude=turning[0].attitude) for p in turning])[0]) == 2
     rng = np.random.default_rng(1)  # automatic exposure while the drone hovers
     for size in (0.1, 0.5, 1.0):
         auto = [replace(p, exposure_stops=float(rng.normal(0, size))) for p in shots(first, [0.0] * 90, each=90)]
         assert unused_exposures(auto)[0] == {}
+    dusk = [replace(p, exposure_stops=k / 3) for k, p in enumerate(shots(first, [0.0] * 40, each=40))]
+    assert unused_exposures(dusk)[0] == {}
 
 
 def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_is_a_default(tmp_path):
@@ -100,6 +107,14 @@ def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_
     assert "void position" in checked[1].doubts[-1]
     everywhere = cross_checked([replace(photo, fix=VOID) for photo in read])
     assert all(photo.lat_lon and "used" in photo.doubts[-1] for photo in everywhere)
+    one_without = cross_checked([replace(p, fix=VOID, lat_lon=p.lat_lon if k else None) for k, p in enumerate(read)])
+    assert [photo.lat_lon is None for photo in one_without] == [True, False, False, False, False]
+    both = ((564.0, "EXIF"), (600.0, "XMP"))
+    flat = [
+        replace(p, fix=FLAT if k == 0 else "", altitude=600.0 if k else 564.0, altitudes=both)
+        for k, p in enumerate(read)
+    ]
+    assert [photo.altitude for photo in cross_checked(flat)] == [None, *[600.0] * 4]
     stale = cross_checked([replace(photo, fix=VOID, lat_lon=read[0].lat_lon) for photo in read])
     assert not any(photo.lat_lon for photo in stale)
 
@@ -109,6 +124,9 @@ def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_
     [
         ("WGS-84", (35.6, 139.7), 0, 0),
         ("", (35.6, 139.7), 0, 0),
+        ("World Geodetic System 1984", (35.6, 139.7), 0, 0),
+        ("EPSG:4326", (35.6, 139.7), 0, 0),
+        ("IGS14", (35.6, 139.7), 0, 0),
         ("TOKYO", (35.6, 139.7), 460, 9),
         ("NAD 27", (40.0, -100.0), 35, 7),
         ("S-42", (55.0, 37.0), 120, 3),
@@ -124,6 +142,16 @@ def test_positions_of_another_datum_are_converted_or_their_error_is_stated(datum
     assert (away, error) == (pytest.approx(moved_m, abs=30), error_m)
     assert (said != "" and datum in said) is (error_m > 0)
     assert ("converted" in said) is (moved_m > 0)
+
+
+@pytest.mark.parametrize(
+    ("own", "name", "is_measured"),
+    [(True, "drone-dji:GpsL", True), (True, "exif:GPSL", False), (False, "exif:GPSL", True)],
+)
+def test_what_editors_copy_from_exif_says_nothing_of_its_fix_and_datum(own, name, is_measured):
+    xmp = {f"{name}atitude": "50.5", f"{name}ongitude": "8.25"}
+    gps = {2: (50.0, 30.0, 0.0), 4: (8.0, 15.0, 0.0)} if own else {}
+    assert is_measured_in_xmp(gps, xmp) is is_measured
 
 
 @pytest.mark.parametrize(("step", "seen"), [(0.0, 0.0), (1.0, 1.0), (3.048, 3.048), (10.0, 10.0), (30.48, 30.48)])

@@ -147,6 +147,8 @@ def test_altitudes_and_their_references(gps, altitude):
         ("+0.1", 0.1),
         ("N 33 30 0", 33.5),
         ("33 minutes", 33),
+        ("33?30'0\" N", 33.5),  # a program without the sign of degrees
+        ("33.5?", None),
         ("x", None),
         ("", None),
         ("50%", None),

@@ -14,6 +14,8 @@ _POINTS, _NMEA = re.compile(r"([+-]?\d{1,3})\.(\d{1,2})\.(\d{1,2}(?:\.\d+)?)"), 
 _UNITS = re.compile(r"degrees?|deg|minutes?|min|seconds?|sec", re.IGNORECASE)
 #: Signs of other things than angles.
 _OTHER_SIGNS = re.compile(r"[%$€#*@!?=<>/|&~^]")
+#: What stands for the sign of degrees where a program lacks it: before minutes.
+_LOST_SIGN = re.compile(r"(?<=\d)[?*](?=\s?\d{1,2}(?:[.,]\d+)?\s?['′’])")
 #: First letters of the words for south and west, north and east, in the axis that they belong to.
 SIDES = {"latitude": ("S", "N"), "longitude": ("W", "E")}
 #: The largest value of each, in degrees.
@@ -47,6 +49,7 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     None for what is no such angle. A comma stands for the decimal point where it is the only one of its text.
     """
     plain = _UNITS.sub(" ", unicodedata.normalize("NFKC", text.replace("\u00ba", " "))).strip()
+    plain = _LOST_SIGN.sub(" ", plain)
     letters = re.findall(r"[A-Za-z]+", re.sub(r"\d[eE][+-]?\d", "00", plain))
     if len(letters) > 1 or _OTHER_SIGNS.search(plain):
         return None

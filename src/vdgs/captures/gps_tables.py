@@ -285,9 +285,10 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     unit = meters_of(word)
     if number is None or (word[number.end() :].strip() and not _DATUM.search(word) and unit == 1):
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
-    value = float(number[1].replace(",", ".")) * (unit if unit != 1 else columns.altitude_unit)
+    value = float(number[1].replace(",", "."))
     if value in NO_DATA:
         return math.nan
+    value *= unit if unit != 1 else columns.altitude_unit
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 

@@ -35,7 +35,7 @@ from vdgs.distributed.resource_allocation import Allocation, MachineResources, S
 from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.errors import RunError, Stopped
 from vdgs.kernels import get_num_threads
-from vdgs.kernels.device_selection import cards_left_out, cards_of
+from vdgs.kernels.device_selection import AnyCard, cards_left_out, cards_of
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import lock_folder
@@ -202,6 +202,7 @@ class ShardedJob:
         self, shards: Sequence[int], share: Allocation, cards: Sequence[str], device: str
     ) -> list[ShardCommand]:
         """The shards, on the cards in turn; on the device where there are none."""
+        device = "cuda" if isinstance(device, AnyCard) else device  # other machines number theirs otherwise
         places = [(card, replace(share.resources, device=card)) for card in cards] or [(device, share.resources)]
         return [
             ShardCommand(index, self.shard(index), self._command(index, share, place), resources, self.kind)

@@ -15,9 +15,11 @@ from vdgs.system.units import first_names
 
 #: A bracket's photographs follow each other within so many seconds and metres (choice).
 NEXT_S, NEXT_M = 2.0, 2.0
+#: A camera that turned by more (degrees; choice) shows another view: panoramas, and corners of a flight.
+SAME_VIEW_DEG = 10.0
 #: Exposures nearer than this (stops) are one exposure; steps of a bracket differ by less.
 SAME_STOPS = 0.2
-#: A camera that takes brackets takes some of so many exposures at least, and none of more.
+#: A camera that takes brackets takes some of so many exposures at least, and none of more (choice).
 LEAST, MOST = 3, 9
 #: Without a bias in EXIF exposures must span so many stops, and such brackets be so much of all (choice): automatic
 #: exposure varies, too.
@@ -82,16 +84,17 @@ def _by_stops(taken: Bracket) -> list[Bracket]:
 
 
 def _runs(taken: Bracket, values: Sequence[float]) -> list[Bracket]:
-    """Photographs that follow each other at one place, each of another exposure; two or more."""
+    """Photographs that follow each other at one place, each of another exposure; two or more. Exposures that
+    go on changing are no bracket: dusk."""
     runs: list[list[int]] = []
     for index, value in enumerate(values):
         run = runs[-1] if runs else []
         other = bool(run) and all(abs(value - values[k]) > SAME_STOPS for k in run)  # false for NaN
-        if other and len(run) < MOST and _is_next(taken[run[-1]], taken[index]):
+        if other and _is_next(taken[run[-1]], taken[index]):
             run.append(index)
         else:
             runs.append([index])
-    return [[taken[k] for k in run] for run in runs if len(run) > 1]
+    return [[taken[k] for k in run] for run in runs if 1 < len(run) <= MOST]
 
 
 def _is_next(before: ImageMetadata, photo: ImageMetadata) -> bool:
@@ -103,5 +106,9 @@ def _is_next(before: ImageMetadata, photo: ImageMetadata) -> bool:
     if places[0] and places[1]:
         away = enu_from_geodetic(np.array([[*places[1], 0.0]]), (*places[0], 0.0))[0]
         if np.linalg.norm(away) > NEXT_M:
+            return False
+    if before.attitude is not None and photo.attitude is not None:
+        turned = np.trace(before.attitude.camera_from_enu @ photo.attitude.camera_from_enu.T)
+        if (turned - 1) / 2 < np.cos(np.radians(SAME_VIEW_DEG)):
             return False
     return all(known[0]) or all(known[1])

@@ -65,19 +65,20 @@ def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
 def _without_void(group: list[ImageMetadata]) -> list[ImageMetadata]:
     """Without positions that EXIF calls void and altitudes that it calls not measured. A receiver without them repeats
     the last: where all photographs of a camera say so and the values differ, the tag is a default."""
-    found = group
+    found = list(group)
     for fix, tag in ((VOID, "a void position (GPSStatus V, or GPSDOP)"), (FLAT, _FLAT)):
-        said = {p.name: p.lat_lon if fix == VOID else p.altitude for p in group if p.fix == fix}
-        values = [value for value in said.values() if value is not None]
-        default = len(values) == len(group) >= LEAST_ALIKE and 2 * len(set(values)) > len(values)
+        known = {p.name: p.lat_lon if fix == VOID else p.altitude for p in group}
+        said = {p.name for p in group if p.fix == fix and known[p.name] is not None}
+        values = [value for value in known.values() if value is not None]
+        default = len(said) == len(values) >= LEAST_ALIKE and 2 * len(set(values)) > len(values)
         why = "but of all photographs of this camera, and the values differ: used" if default else "not used"
         for k, photo in enumerate(found):
-            if said.get(photo.name) is None:
+            if photo.name not in said:
                 continue
             kept = replace(photo, doubts=(*photo.doubts, f"EXIF says {tag}; {why}"))
             if not default:
-                kept = replace(kept, lat_lon=None) if fix == VOID else replace(kept, altitude=None)
-            found = [*found[:k], kept, *found[k + 1 :]]
+                kept = replace(kept, lat_lon=None) if fix == VOID else replace(kept, altitude=None, altitudes=None)
+            found[k] = kept
     return found
 
 

@@ -65,7 +65,7 @@ def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | 
     EXIF's block comes first. XMP fills what the block lacks, a place or its side of the Earth. Where the two are
     different places neither is believed.
     """
-    in_xmp = place_in_xmp(xmp)
+    in_xmp = _place_in_xmp(xmp)
     if gps.get(2) is None and gps.get(4) is None:
         return in_xmp, ""
     found = {axis: _angle(gps, axis) for axis in _TAGS}
@@ -100,6 +100,13 @@ def read_fix(gps: Mapping[int, Any]) -> str:
     if status.startswith("V") or (finite(gps.get(11)) or 0.0) >= NO_FIX:
         return VOID
     return FLAT if mode == "2" else ""
+
+
+def is_measured_in_xmp(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> bool:
+    """Whether XMP has a place of its own, so that what EXIF says of its fix and its datum does not count. Editors copy
+    EXIF's place to `exif:`."""
+    has_own = gps.get(2) is not None or gps.get(4) is not None
+    return _place_in_xmp({k: v for k, v in xmp.items() if not (has_own and k.startswith("exif:"))}) is not None
 
 
 def dilution(gps: Mapping[int, Any]) -> float | None:
@@ -193,7 +200,7 @@ def _is_infinite(value: Any) -> bool:
     return getattr(value, "denominator", 1) == 0 and numerator not in (0, None) and not math.isnan(numerator)
 
 
-def place_in_xmp(xmp: Mapping[str, str]) -> Place | None:
+def _place_in_xmp(xmp: Mapping[str, str]) -> Place | None:
     """Latitude and longitude in degrees."""
     read = []
     for axis, names in _XMP.items():

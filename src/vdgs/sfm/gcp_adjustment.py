@@ -15,7 +15,7 @@ from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear, rotation_to_z
 from vdgs.sfm.bending import bend_to_points
-from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint
+from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint, are_along_line
 from vdgs.sfm.georegistration import transform_model
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -185,13 +185,7 @@ def adjust_to_gcps(
             f"there. Are they pixels of photographs of another size, or of other points? {ANYWAY_GCP}"
         )
     rows = np.array([k for k, _ in used], int)
-    if len(used) < MIN_CONTROL_POINTS or is_collinear(np.nan_to_num(targets[rows])):
-        bad = f", {len(wrong)} more are marked where they cannot be" if wrong else ""
-        raise CaptureError(
-            f"{gcps.source}: {len(used)} of its points are shown by two placed photographs or more, not along one "
-            f"line{bad}; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them "
-            "out: --check-points all"
-        )
+    _check_enough(targets[rows], len(wrong), gcps.source)
     places = np.array([seen.position for _, seen in used])
     known = np.isfinite(targets[rows, 2])
     is_level = is_collinear(places[known])  # too few heights
@@ -210,10 +204,22 @@ def adjust_to_gcps(
         accuracy = replace(accuracy, place_m=(*across, *up_m), level_deg=2 * level.deviation_deg)
         by = "points with heights" if known.any() else "GPS" if level.gps is not None else "nothing"
         notes = (f"too few control points have heights to level or to bend the model: heights are by {by}.",)
+    elif is_collinear(aims[trusted & known]):
+        notes = ("too few control points with heights fit the others to bend the model; it is not bent.",)
     else:
         model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in firm], fix_focal, threads)
     doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
     return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
+
+
+def _check_enough(targets: Float[np.ndarray, "n 3"], num_wrong: int, source: str) -> None:
+    if len(targets) < MIN_CONTROL_POINTS or are_along_line(targets):
+        bad = f", {num_wrong} more are marked where they cannot be" if num_wrong else ""
+        raise CaptureError(
+            f"{source}: {len(targets)} of its points are shown by two placed photographs or more, not along one "
+            f"line{bad}; {MIN_CONTROL_POINTS} are needed. Mark them in more photographs, or hold them "
+            "out: --check-points all"
+        )
 
 
 def _depth_beside_surface(
@@ -281,7 +287,7 @@ def _with_heights(
         elif level.gps is not None:
             heights += np.median(level.gps.apply(places)[:, 2] - heights)
     else:
-        heights = fit_similarity(places[known], targets[known]).apply(places)[:, 2]
+        heights = _fit_to_gcps(places[known], targets[known])[0].apply(places)[:, 2]
     measured = targets if not is_level else np.full_like(targets, np.nan)  # all heights there are by one plane
     return np.column_stack([targets[:, :2], np.where(np.isfinite(measured[:, 2]), targets[:, 2], heights)])
 

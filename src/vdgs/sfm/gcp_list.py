@@ -182,6 +182,13 @@ def _geodetic(lines: Sequence[_Line], name: str, transform: Any, system: str, fi
     return latitude, longitude, math.nan if flat else height
 
 
+def are_along_line(targets: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether points of which some have no height (NaN) fix no rotation: those with heights in space, or all in the
+    plane, must lie beside one line."""
+    known = np.isfinite(targets[:, 2])
+    return is_collinear(targets[known]) and (bool(known.all()) or is_collinear(np.nan_to_num(targets) * [1, 1, 0]))
+
+
 def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, float, float], file: Path) -> None:
     """Raise CaptureError where the points [n, 3] lie nowhere near the positions [m, 3] of the photographs."""
     if not len(positions):
@@ -309,7 +316,7 @@ def _checked(points: list[GroundControlPoint], system: str, file: Path, notes: S
         )
     control = GcpList(tuple(seen), system, file.name, tuple(notes))
     targets = control.enu(control.median_origin)[[not point.is_check_point for point in seen]]
-    if used and is_collinear(np.nan_to_num(targets)):
+    if used and are_along_line(targets):
         raise CaptureError(
             f"{file}: its points lie along one line, about which a scene could still turn. Survey one beside it, or "
             f"use them as check points: --check-points {ALL_POINTS}"

@@ -20,7 +20,7 @@ from vdgs.sfm.exif_gps import (
     Altitude,
     dilution,
     finite,
-    place_in_xmp,
+    is_measured_in_xmp,
     plain_text,
     read_altitudes,
     read_fix,
@@ -255,7 +255,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     if orientation in TRANSPOSED_ORIENTATIONS:
         width, height = height, width
     place, unclear = read_place(gps, xmp)
-    in_xmp = place_in_xmp(xmp) is not None
+    in_xmp = is_measured_in_xmp(gps, xmp)
     datum, datum_error_m = "", 0.0
     if place is not None and not in_xmp:
         place, datum, datum_error_m = to_wgs84(place, gps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Mapping
@@ -12,7 +13,8 @@ from vdgs.sfm.exif_gps import Place, plain_text
 
 #: Datums that agree with WGS 84 to a metre or two.
 _GLOBAL = re.compile(
-    r"WGS[-_ ]*(19)?84|ITRF|ETRS|JGD|CGCS|GDA|NAD[-_ ]*(19)?83|SIRGAS|PZ[-_ ]*90|GRS[-_ ]*(19)?80|KGD|NZGD[-_ ]*20",
+    r"WGS[-_ ]*(19)?84|ITRF|ETRS|JGD|CGCS|GDA|NAD[-_ ]*(19)?83|SIRGAS|PZ[-_ ]*90|GRS[-_ ]*(19)?80|KGD|NZGD[-_ ]*20"
+    r"|IGS[-_ ]?\d|\bWG?S?84\b|WORLD GEODETIC SYSTEM([-_ ]*OF)?[-_ ]*(19)?84|^(EPSG:*)?(4326|4979)$",
     re.I,
 )
 _NOTHING = re.compile(r"unknown|undefined|none|n/?a|null|0*|-*", re.I)
@@ -45,7 +47,9 @@ def to_wgs84(place: Place, gps: Mapping[int, Any]) -> tuple[Place, str, float]:
         return place, f"{_of(datum, error_m)}; {remedy}", error_m
     change, error_m = found
     longitude, latitude = change.transform(place[1], place[0])
-    return (latitude, longitude), f"positions are of the datum {datum}: converted (good to {error_m:.0f} m)", error_m
+    if not math.isfinite(latitude + longitude):  # beside a grid
+        return place, _of(datum, UNKNOWN_M), UNKNOWN_M
+    return (latitude, longitude), f"positions are of the datum {datum}: converted (good to {error_m:.2g} m)", error_m
 
 
 def _of(datum: str, error_m: float) -> str:

@@ -212,7 +212,7 @@ def _points(
     what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
     option = " and give --format transforms"
     found = find_sparse_points(root, poses, what, option=option, needs_points=needs_points)
-    if cloud is not None:
+    if cloud is not None and len(found[0]):
         notes.append(
             f"{cloud}: is not there, though {TRANSFORMS_FILE} names it; {len(found[0]):,} points beside it are used."
         )
