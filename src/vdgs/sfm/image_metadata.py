@@ -225,16 +225,13 @@ class ImageMetadata:
         }[self.orientation]  # fmt: skip
 
 
-def read_image_metadata(path: Path, name: str) -> ImageMetadata:
-    """Read the head of a photograph; its pixels are not decoded, unless its end is missing.
-
-    Raises `UnusableImage` for files that are no image, too small, of colors that are not understood, or cut off.
-    """
+def _read_head(path: Path) -> tuple[int, ImageTags, dict[str, str], bool]:
+    """The bytes of a photograph, its tags, its XMP and whether it is a panorama."""
     try:
         size, found = path.stat().st_size, read_tags(path)
         _check(found)
         xmp = read_xmp(found.xmp_packet)
-        panorama = _is_panorama(found, xmp)
+        return size, found, xmp, _is_panorama(found, xmp)
     except UnusableImage:
         raise
     except CaptureError as error:
@@ -246,6 +243,14 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         raise UnusableImage(f"cannot be read ({why}): copy it again") from None
     except (SyntaxError, ValueError, TypeError, KeyError, struct.error, OverflowError, MemoryError) as error:
         raise UnusableImage(f"is damaged ({error}): copy it again") from None
+
+
+def read_image_metadata(path: Path, name: str) -> ImageMetadata:
+    """Read the head of a photograph; its pixels are not decoded, unless its end is missing.
+
+    Raises `UnusableImage` for files that are no image, too small, of colors that are not understood, or cut off.
+    """
+    size, found, xmp, panorama = _read_head(path)
     tags, details, gps, width, height = found.tags, found.details, found.gps, found.width, found.height
     orientation = tags.get(0x0112, 1)
     orientation = orientation if orientation in range(1, 9) else 1

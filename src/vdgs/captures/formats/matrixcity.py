@@ -91,12 +91,8 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
             views.append(view)
             scales.add(scale)
     warnings = _missing(missing, count, root, options.strict)
-    sides = {side: {view.image_path for view in views if view.split == side} for side in ("train", "test")}
-    both = [v.name for v in views if v.split == "train" and v.image_path in sides["test"]]
-    views = one_view_each([view for view in views if view.split == "test" or view.name not in both], root, bad)
-    if both:
-        said = "in the training file and in the test file; only for the test, not for training"
-        warnings += (f"{first_names(both)}: {said}.",)
+    views, both = _without_tested(views)
+    views, warnings = one_view_each(views, root, bad), warnings + both
     warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
     if len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
@@ -135,6 +131,17 @@ def _of_a_city(frame: JsonObject) -> bool:
     if "rot_mat" in frame or "frame_index" in frame:
         return True
     return any(CITY_PATTERN.fullmatch(part) for part in PurePosixPath(str(frame.get("file_path", ""))).parts)
+
+
+def _without_tested(views: list[SourceView]) -> tuple[list[SourceView], tuple[str, ...]]:
+    """The views without training views of photographs that are also for the test, and what to say of these."""
+    tested = {view.image_path for view in views if view.split == "test"}
+    both = [view.name for view in views if view.split == "train" and view.image_path in tested]
+    if not both:
+        return views, ()
+    said = "in the training file and in the test file; only for the test, not for training"
+    kept = [view for view in views if view.split == "test" or view.image_path not in tested]
+    return kept, (f"{first_names(both)}: {said}.",)
 
 
 def _missing(missing: list[str], count: int, root: Path, strict: bool) -> tuple[str, ...]:
