@@ -57,8 +57,8 @@ def test_a_browser_without_network_draws_what_we_draw(tmp_path, width, height):
     camera = Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
     with torch.no_grad():
         expected = render_gaussians(gaussians, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
-    # Beside what the client says of software rendering.
-    part = slice(60, 440) if width > height else slice(200, 440), slice(width // 2, width - 60)
+    # Beside what the client says of software rendering, and below the box.
+    part = slice(90, 430) if width > height else slice(200, 440), slice(width // 2, width - 60)
     with open_page((tmp_path / "scene.html").as_uri(), width, height, offline=True) as shown:
 
         def likeness() -> float:

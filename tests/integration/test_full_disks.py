@@ -179,6 +179,7 @@ def goes_on(nine: Flight, folder: Path) -> None:
     reconstruct(SfmRequest(image_folders=(nine.folder,), output=folder, threads=1), Console(file=io.StringIO()))
 
 
+@pytest.mark.usefixtures("few_features")
 @pytest.mark.parametrize(
     ("step", "rooms"),
     [("features", (0, 64 << 10, 400 << 10)), ("matching", (24 << 10,)), ("mapping", (100 << 10,))],
