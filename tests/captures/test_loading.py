@@ -37,11 +37,6 @@ def up(**options) -> CaptureOptions:
 
 
 @pytest.fixture
-def scene() -> TinyScene:
-    return tiny_scene()
-
-
-@pytest.fixture
 def folder(tmp_path, scene):
     write_colmap(tmp_path, scene)
     return tmp_path

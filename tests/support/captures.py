@@ -15,7 +15,7 @@ import struct
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -23,6 +23,9 @@ import pytest
 
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
+
+if TYPE_CHECKING:
+    from vdgs.captures.capture import Capture
 
 MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4}
 
@@ -235,3 +238,16 @@ def data_folder(name: str) -> Path:
     if not (base / name / "sparse").is_dir():
         pytest.skip(f"no real capture {name!r} (set VDGS_DATA)")
     return base / name
+
+
+def assert_sees_the_scene(capture: Capture, scene: TinyScene, rename=lambda name: name) -> None:
+    """Every point falls on the same pixel as in the scene that was written."""
+    assert len(capture.views) == len(scene.cameras)
+    assert len(capture.points) == len(scene.points)
+    np.testing.assert_array_equal(capture.point_colors, scene.colors)
+    for view in capture.views:
+        camera = scene.cameras[rename(view.name)]
+        expected, depth = camera.project(scene.points)
+        found, _ = view.camera.project(capture.points)
+        front = depth > 1
+        np.testing.assert_allclose(found[front], expected[front], atol=1e-3)

@@ -17,6 +17,29 @@ DRB = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 
 
+def write_transforms(root: Path, scene: TinyScene, applied: np.ndarray | None = None, **changes) -> dict:
+    """As ns-process-data: poses and cloud both in the world after `applied`."""
+    world = np.eye(4) if applied is None else applied
+    first = next(iter(scene.cameras.values()))
+    content: dict = {
+        "camera_model": "OPENCV", "w": first.width, "h": first.height, "fl_x": first.fx, "fl_y": first.fy,
+        "cx": first.cx, "cy": first.cy, "k1": 0.0, "ply_file_path": "sparse_pc.ply",
+        "frames": [
+            {"file_path": f"images/{name}", "transform_matrix": (
+                world @ np.linalg.inv(camera.camera_from_world) @ OPENGL).tolist()}
+            for name, camera in scene.cameras.items()
+        ],
+    }  # fmt: skip
+    if applied is not None:
+        content["applied_transform"] = applied[:3].tolist()
+    content |= changes
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    write_ply(root / "sparse_pc.ply", scene.points @ world[:3, :3].T + world[:3, 3], scene.colors)
+    write_images(root / "images", scene)
+    return content
+
+
 def write_mega_nerf(root: Path, scene: TinyScene, scale: float = 50.0) -> TinyScene:
     """As Mega-NeRF's converter: DRB world, moved and scaled.
 

@@ -1,0 +1,132 @@
+"""Mega-NeRF and MatrixCity: written here as their tools write them, read as one scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.captures import (
+    TinyScene,
+    assert_sees_the_scene,
+    moved,
+    write_colmap,
+    write_images,
+    write_ply,
+)
+from support.dataset_layouts import (
+    DRB,
+    halves,
+    matrixcity_frames,
+    write_matrixcity,
+    write_mega_nerf,
+)
+from vdgs.captures.loading import load_capture
+from vdgs.errors import CaptureError
+
+# -------------------------------------------------------------------------------------------- Mega-NeRF
+
+
+@pytest.mark.parametrize("points", ["ply", "colmap", "colmap of the originals"])
+def test_mega_nerf(tmp_path, scene, points):
+    """The split is the shipped one, down is x, and points may come from a COLMAP model in any world."""
+    renamed = write_mega_nerf(tmp_path, scene)
+    if points == "ply":
+        write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colors)
+    else:
+        of = scene if "originals" in points else TinyScene(
+            {Path(name).name: camera for name, camera in renamed.cameras.items()}, scene.points, scene.colors
+        )  # fmt: skip
+        angle = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+        write_colmap(tmp_path, moved(of, 0.07, angle, np.array([1.0, 2, 3])), images=None)
+    capture = load_capture(tmp_path)
+    assert capture.source == "mega-nerf"
+    assert capture.ground.metric
+    assert {view.name for view in capture.test_views} == {n for n in renamed.cameras if n.startswith("val/")}
+    assert_sees_the_scene(capture, renamed)
+    back = capture.points - np.median(capture.points, axis=0)
+    np.testing.assert_allclose(back, scene.points - np.median(scene.points, axis=0), atol=1e-3)
+
+
+def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
+    write_mega_nerf(tmp_path, scene)
+    with pytest.raises(CaptureError, match=r"brings no 3D points(?s:.)*points3D\.ply"):
+        load_capture(tmp_path)
+    write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colors)
+    file = tmp_path / "train" / "metadata" / "000001.pt"
+    whole = file.read_bytes()
+    for content in (whole[:100], b"", b"not torch at all", whole[:-60]):
+        file.write_bytes(content)
+        with pytest.raises(CaptureError, match=r"000001\.pt: cannot be read as a torch file"):
+            load_capture(tmp_path)
+    torch.save({"H": 48, "W": 64}, file)
+    with pytest.raises(CaptureError, match="needs 'intrinsics'"):
+        load_capture(tmp_path)
+    file.write_bytes(whole)
+    gone = sorted((tmp_path / "train" / "rgbs").glob("*.png"))[:7]
+    for image in gone:
+        image.unlink()
+    with pytest.raises(CaptureError, match=r"[67] of 12 images .* are missing(?s:.)*000002(?s:.)*UrbanScene3D"):
+        load_capture(tmp_path)
+
+
+def test_a_foreign_colmap_model_is_refused(tmp_path, scene):
+    write_mega_nerf(tmp_path, scene)
+    shuffled = np.random.default_rng(0).permutation(list(scene.cameras))
+    others = dict(zip(shuffled.tolist(), scene.cameras.values(), strict=True))
+    write_colmap(tmp_path, TinyScene(others, scene.points, scene.colors), images=None)
+    with pytest.raises(CaptureError, match="disagree"):
+        load_capture(tmp_path)
+
+
+# -------------------------------------------------------------------------------------------- MatrixCity
+
+
+def test_matrixcity_pose_folder(tmp_path, scene):
+    """pose/<block>/transforms_train.json: units of 100 m, images found above, in their blocks."""
+    train, test = halves(scene)
+    root = tmp_path / "aerial" / "pose" / "block_A"
+    both = write_matrixcity(root, train, test)
+    capture = load_capture(root)
+    assert capture.source == "matrixcity"
+    assert capture.ground.metric
+    assert (len(capture.train_views), len(capture.test_views)) == (9, 3)
+    assert_sees_the_scene(capture, both)
+    np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
+    files = [root / f"transforms_{side}.json" for side in ("train", "test")]
+    contents = [json.loads(file.read_text()) for file in files]
+    contents[1]["frames"].append(contents[0]["frames"][8])
+    files[1].write_text(json.dumps(contents[1]))
+    twice = load_capture(root)
+    assert (len(twice.train_views), len(twice.test_views)) == (8, 4)
+    assert any("0008.png: in the training file and in the test file" in warning for warning in twice.warnings)
+    for k in range(7):
+        (tmp_path / "aerial" / "train" / "block_1" / f"000{k}.png").unlink()
+    with pytest.raises(CaptureError, match=r"7 of 13 images .* are missing(?s:.)*0003\.png(?s:.)*Unpack the \.tar"):
+        load_capture(root)
+
+
+def test_matrixcity_blocks(tmp_path, scene):
+    """train/<block>/transforms.json: metres, the rotation divided by 100, images in rgb/."""
+    train, test = halves(scene)
+    first = next(iter(scene.cameras.values()))
+    for part, block in ((train, "train/block_1"), (test, "test/block_1_test")):
+        frames = []
+        for frame in matrixcity_frames(part, block, 1.0):
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, :3] *= 0.01
+            frames.append({"frame_index": frame["frame_index"], "rot_mat": pose.tolist()})
+        (tmp_path / block).mkdir(parents=True)
+        content = {"camera_angle_x": 2 * np.arctan(first.width / 2 / first.fx), "frames": frames}
+        (tmp_path / block / "transforms.json").write_text(json.dumps(content))
+        write_images(tmp_path / block / "rgb", part)
+    write_ply(tmp_path / "points3D.ply", scene.points, scene.colors)
+    capture = load_capture(tmp_path)
+    assert capture.ground.metric
+    both = {f"train/block_1/rgb/{n}": c for n, c in train.cameras.items()}
+    both |= {f"test/block_1_test/rgb/{n}": c for n, c in test.cameras.items()}
+    assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colors))
+    np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)

@@ -1,0 +1,143 @@
+"""What single fields of transforms.json may say, and what is said of mistakes in them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from support.captures import (
+    assert_sees_the_scene,
+    tiny_scene,
+)
+from support.dataset_layouts import (
+    write_transforms,
+)
+from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
+from vdgs.captures.formats.lens_projection import ray_pixels
+from vdgs.captures.formats.source_capture import Intrinsics
+from vdgs.captures.loading import load_capture
+from vdgs.errors import CaptureError
+
+FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def test_angles_stand_in_for_focal_lengths(tmp_path, scene):
+    camera = next(iter(scene.cameras.values()))
+    content = write_transforms(tmp_path, scene)
+    for key in ("fl_x", "fl_y", "w", "h", "cx", "cy"):
+        content.pop(key)
+    content["camera_angle_x"] = 2 * np.arctan(camera.width / 2 / camera.fx)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert_sees_the_scene(load_capture(tmp_path), scene)
+
+
+@pytest.mark.parametrize("says", [
+    {"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True},
+])  # fmt: skip
+def test_fisheyes_are_read_as_such(says):
+    """nerfstudio names the model; instant-ngp knows `is_fisheye` and no model. Both mean k1...k4 of OpenCV's."""
+    lens = {"fl_x": 50.0, "fl_y": 51.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    lens |= {"k1": 0.04, "k2": 0.03, "k3": 0.02, "k4": 0.01}
+    found = parse_intrinsics({}, lens | says, Path("a.png"), Path("transforms.json"))
+    assert found == Intrinsics("OPENCV_FISHEYE", (50.0, 51.0, 32.0, 24.0, 0.04, 0.03, 0.02, 0.01), 64, 48)
+
+
+def test_distortion_is_read_from_keys_and_lists_alike():
+    lens = {
+        "fl_x": 50.0,
+        "fl_y": 51.0,
+        "cx": 32.0,
+        "cy": 24.0,
+        "w": 64,
+        "h": 48,
+        "k5": 0.0,
+        "rolling_shutter": [0, 0.0],
+    }
+    by_keys = lens | {"k1": 0.04, "k2": 0.03, "p1": 0.02, "p2": 0.01}
+    by_list = lens | {"distortion_params": [0.04, 0.03, 0, 0, 0.02, 0.01]}
+    one, other = (parse_intrinsics({}, each, Path("a.png"), Path("transforms.json")) for each in (by_keys, by_list))
+    assert one == other
+    assert one.model == "OPENCV"
+    found = parse_intrinsics({}, by_keys | {"k3": -0.02, "k4": 0.3}, Path("a.png"), Path("transforms.json"))
+    x, y, r2 = 0.3, -0.4, 0.25
+    radial = 1 + 0.04 * r2 + 0.03 * r2**2 - 0.02 * r2**3 + 0.3 * r2**4
+    bent = x * radial + 2 * 0.02 * x * y + 0.01 * (r2 + 2 * x * x), y * radial + 0.02 * (r2 + 2 * y * y) + 0.02 * x * y
+    np.testing.assert_allclose(ray_pixels(found, np.array([[x, y]]))[0], (50 * bent[0] + 32, 51 * bent[1] + 24))
+
+
+def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
+    return {"file_path": path, "transform_matrix": pose.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": []}, "none"),
+        ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
+        ({"frames": [frame(2 * np.eye(4))]}, "orthonormal"),
+        ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the capture"),
+        ({"frames": [frame(np.eye(4), "images/no.png")]}, r"1 of 1 images .* are missing(?s:.)*no\.png"),
+        ({"fl_x": "wide"}, "finite number"),
+        ({"fl_x": -3.0, "fl_y": -3.0}, "focal length"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "not supported"),
+        ({"camera_model": "FISHEYE624"}, "'FISHEYE624' is not supported; undistort"),
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": 61.0}, "camera_angle_x 61 must be radians"),
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "'THIN_PRISM_FISHEYE' is not supported; undistort"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye contradicts the camera model OPENCV"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "p1, p2 of a fisheye"),
+        ({"k6": 0.01}, "lens parameter k6 is not supported"),
+        ({"rolling_shutter": [0, 0, 0.1, 0]}, "rolling_shutter is not supported"),
+        ({"distortion_params": [0.1]}, "must be a list of k1"),
+        ({"ftheta_p0": 0.0}, "'ftheta_p0' describes is not supported"),
+        ({"ply_file_path": "../../cloud.ply"}, "inside the capture"),
+        ({"ply_file_path": None}, None),
+        ({"applied_transform": (3 * np.eye(4)[:3]).tolist()}, "orthonormal"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_transforms_json_are_named(tmp_path, scene, changes, message):
+    write_transforms(tmp_path, scene, **changes)
+    if message is None:  # sparse_pc.ply is found by its usual name
+        assert len(load_capture(tmp_path).points) == len(scene.points)
+        return
+    with pytest.raises(CaptureError, match=message):
+        load_capture(tmp_path)
+
+
+@FUZZ
+@given(data=st.data())
+def test_damaged_transforms_json_ends_in_a_message_or_a_capture(tmp_path, data):
+    write_transforms(tmp_path, tiny_scene(columns=2, rows=2, points=8))
+    file = tmp_path / "transforms.json"
+    content = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        position = data.draw(st.integers(0, len(content) - 1))
+        match data.draw(st.sampled_from(["flip", "digit", "cut"])):
+            case "flip":
+                content[position] ^= 1 << data.draw(st.integers(0, 7))
+            case "digit":
+                content[position : position + 1] = data.draw(
+                    st.sampled_from([b"9e999", b"null", b"[]", b"{}", b'""', b"-"])
+                )
+            case "cut":
+                del content[position : position + data.draw(st.integers(1, 400))]
+        content = content or bytearray(b"{}")
+    file.write_bytes(bytes(content))
+    with contextlib.suppress(CaptureError):
+        capture = load_capture(tmp_path)
+        assert all(np.isfinite(view.camera.camera_from_world).all() for view in capture.views)
+        assert np.isfinite(capture.points).all()
+
+
+def test_a_transposed_pose_is_refused(tmp_path):
+    """Without a look at the last row all cameras would stand at the origin."""
+    place = np.eye(4)
+    place[:3, 3] = 3.0, 4.0, 5.0
+    assert np.array_equal(parse_matrix(place.tolist(), tmp_path, "frame 1"), place)
+    with pytest.raises(CaptureError, match=r"frame 1 has a matrix whose last row is not 0 0 0 1\. It seems transposed"):
+        parse_matrix(place.T.tolist(), tmp_path, "frame 1")
