@@ -51,7 +51,6 @@ demo: setup
 	$(BIN)/vdgs inspect $(DEMO)/capture --output $(DEMO)/inspect
 	$(BIN)/vdgs run $(DEMO)/capture --output $(DEMO)/run --preset laptop --blocks 4 --iterations 2000 --block.iterations 500
 	$(BIN)/vdgs export $(DEMO)/run --output $(DEMO)/run/scene.html --color-iterations 1
-	$(BIN)/vdgs report $(DEMO)/run
 	@echo
 	@echo "test views:  $(DEMO)/run/evaluation/contact_sheet.png"
 	@echo "metrics:     $(DEMO)/run/evaluation/metrics.json"

@@ -20,7 +20,8 @@ from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.plots import block_maps as figures
-from vdgs.partition.plots.block_stats import BLOCK_PALETTE, block_color, compute_block_stats
+from vdgs.partition.plots.block_colors import BLOCK_PALETTE, block_color
+from vdgs.partition.plots.block_stats import compute_block_stats
 from vdgs.partition.plots.score_heatmap import sort_cameras
 from vdgs.pipeline.partition_stage import describe_partition
 from vdgs.system import figure_style

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vdgs.partition.plots.block_stats import block_color
+from vdgs.partition.plots.block_colors import block_color
 from vdgs.report.charts import MERGED_COLOR, Curve, draw_curves
 from vdgs.report.html_page import (
     Html,

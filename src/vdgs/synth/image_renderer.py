@@ -51,9 +51,7 @@ def surface_at(
     uv = sum(w * texture[:, k] for k, w in enumerate(weights))
     normal = sum(w * normals[:, k] for k, w in enumerate(weights))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    corners = mesh.vertices[mesh.faces[triangle]]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True) + np.float32(1e-20)
+    flat = mesh.face_normals[triangle]
     away = np.einsum("ij,ij->i", flat, directions) > 0
     flat = np.where(away[:, None], -flat, flat)
     normal = np.where((np.einsum("ij,ij->i", normal, flat) < 0)[:, None], -normal, normal)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +36,13 @@ class Mesh:
     panel: np.ndarray
     normals: np.ndarray
 
+    @cached_property
+    def face_normals(self) -> np.ndarray:
+        """Unit normals of the triangles by their corners, [f, 3]; 0 where a triangle has no area."""
+        corners = self.vertices[self.faces]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return flat / (np.linalg.norm(flat, axis=1, keepdims=True) + np.float32(1e-20))
+
 
 def srgb(code: str) -> np.ndarray:
     """A color as people write it ("#c8a27a") to linear light, [3] float32."""
@@ -53,7 +61,7 @@ _Skin = tuple[Material, np.ndarray, float]
 
 def join_meshes(first: Mesh, second: Mesh) -> Mesh:
     """Both as one; the triangles of the first keep their numbers."""
-    return Mesh(**_join([vars(first), vars(second)]))
+    return Mesh(**_join([{each.name: getattr(mesh, each.name) for each in fields(mesh)} for mesh in (first, second)]))
 
 
 class MeshBuilder:

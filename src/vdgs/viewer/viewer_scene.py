@@ -25,6 +25,7 @@ from vdgs.model.lod_scene import LodScene, NodeContent
 from vdgs.model.lod_tree import ANCHOR_COST, LodTree
 from vdgs.model.renderer import Drawable, render
 from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.partition.plots.block_colors import block_color
 from vdgs.runs.lod_folder import find_tree
 from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
 from vdgs.runs.visibility_store import get_run_visibility, with_fade
@@ -290,7 +291,5 @@ def _keep_last(kept: dict[_Key, _Kept], key: _Key, make: Callable[[], _Kept]) ->
 
 def block_rgb(block: int) -> tuple[int, int, int]:
     """The color of a block in all figures, 0 to 255."""
-    from vdgs.partition.plots.block_stats import block_color  # brings matplotlib: not before the first picture
-
     red, green, blue = bytes.fromhex(block_color(block).lstrip("#"))
     return red, green, blue

@@ -18,7 +18,8 @@ from matplotlib.path import Path as Outline
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.similarity import sample_points
 from vdgs.partition.blocks import Blocks
-from vdgs.partition.plots.block_stats import block_color, compute_block_stats, mix_color, plot_block_stats, std_note
+from vdgs.partition.plots.block_colors import block_color
+from vdgs.partition.plots.block_stats import compute_block_stats, mix_color, plot_block_stats, std_note
 from vdgs.partition.plots.score_heatmap import plot_scores
 from vdgs.system.figure_style import (
     INK,

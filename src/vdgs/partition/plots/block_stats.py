@@ -14,18 +14,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.partition.plots.block_colors import block_color
 from vdgs.system.figure_style import INK, MUTED, draw_titles, new_figure, pluralize, style_axes, write_png
-
-#: Colors of blocks 0 to 15; block 16 begins anew. Neighbors in the list differ most.
-BLOCK_PALETTE = (
-    "#4363d8", "#f58231", "#3cb44b", "#e6194b", "#911eb4", "#42c6e0", "#e0bd00", "#f032e6",
-    "#9a6324", "#469990", "#a3cf3f", "#000075", "#f0a3c0", "#800000", "#b79be6", "#808000",
-)  # fmt: skip
-
-
-def block_color(index: int) -> str:
-    """The color of a block in all figures."""
-    return BLOCK_PALETTE[index % len(BLOCK_PALETTE)]
 
 
 def mix_color(color: str, scale: float, tone: float = 1.0) -> tuple[float, float, float]:
