@@ -18,16 +18,18 @@ from support.clusters import (
     MIDDLE,
     NODE_LOST,
     QUICK_STARTS,
+    TESTS,
     Cluster,
     alive,
     copy_run,
     evaluated,
+    keeper_of,
     models,
-    parent_of,
     shard_of,
     waiting_shards,
 )  # fmt: skip
 from support.commands import PATIENCE_SECONDS, Command, begun, do_tasks_here, python, vdgs, wait_until
+from support.shard_server import shard_server
 from vdgs import cli
 
 pytestmark = [
@@ -40,11 +42,12 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def cluster():
-    cluster = Cluster()
-    cluster.add("a")
-    cluster.add("b")
-    yield cluster
-    cluster.close()
+    with shard_server() as variables:
+        cluster = Cluster(variables)
+        cluster.add("a")
+        cluster.add("b")
+        yield cluster
+        cluster.close()
 
 
 def on_ray(run: Path, cluster: Cluster) -> tuple[object, ...]:
@@ -130,7 +133,7 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
         processes = waiting_shards(driver, 2)
         cluster.remove(cluster.node_of(processes[1]))
         wait_until(lambda: not alive(processes[1]))
-        cluster.add("stranger", {"PYTHONPATH": str(stranger)})
+        cluster.add("stranger", {"PYTHONPATH": os.pathsep.join(map(str, (stranger, TESTS)))})
         wait_until(lambda: "crashed by a node that cannot work on the run" in driver.printed())
         full = {"RAY_memory_monitor_refresh_ms": "100", "RAY_memory_usage_threshold": "0.001"}
         cluster.add("small", full, memory=1 << 30)
@@ -142,7 +145,7 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
         again = waits_again(driver, 0, processes[0])
         # The driver knows of the second attempt: what it has not heard of yet it cannot lose.
         wait_until(lambda: driver.printed().count("block 00: started") == 2)
-        os.kill(parent_of(again), signal.SIGKILL)
+        os.kill(keeper_of(again), signal.SIGKILL)
         slow = waits_again(driver, 0, processes[0], again)
         os.kill(slow, signal.SIGSTOP)
         driver.go_on()
@@ -181,5 +184,6 @@ def another_vdgs(folder: Path) -> Path:
     # An installation that leads to its sources by a hook would lead there from that node too.
     (folder / "sitecustomize.py").write_text(
         "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
+        "from support.ray_agents import stand_in_for_agents\nstand_in_for_agents()\n"
     )
     return folder

@@ -16,11 +16,12 @@ from support.clusters import (
     alive,
     copy_run,
     evaluated,
+    keeper_of,
     models,
-    parent_of,
     waiting_shards,
 )  # fmt: skip
 from support.commands import begun, vdgs, wait_until
+from support.shard_server import VARIABLE, shard_server, started
 from support.slurm import is_installed, real, stand_in
 from vdgs.config.executor_options import SlurmOptions
 from vdgs.distributed import slurm_commands
@@ -45,8 +46,8 @@ def slurm(request, tmp_path, monkeypatch) -> str:
     """SLURM's commands find a cluster of two places."""
     folder = tmp_path / "slurm"
     folder.mkdir()
-    with real(folder) if request.param == "real" else stand_in(folder) as variables:
-        for name, value in variables.items():
+    with shard_server() as forks, real(folder) if request.param == "real" else stand_in(folder) as variables:
+        for name, value in (forks | variables).items():
             monkeypatch.setenv(name, value)
         yield request.param
 
@@ -57,13 +58,13 @@ def by_slurm(run: Path) -> tuple[object, ...]:
 
 def variables() -> dict[str, str]:
     """What commands must be told: those of the tests are forked from a process that was started before."""
-    names = ("SLURM_CONF", "VDGS_TEST_SLURM", "PATH")
+    names = ("SLURM_CONF", "VDGS_TEST_SLURM", "PATH", "PYTHONPATH", VARIABLE)
     return {name: os.environ[name] for name in names if name in os.environ}
 
 
 def element_of(process: int) -> str:
     """The job that a process belongs to."""
-    words = Path(f"/proc/{process}/environ").read_bytes().decode().split("\0")
+    words = Path(f"/proc/{started(process)}/environ").read_bytes().decode().split("\0")
     told = dict(word.partition("=")[::2] for word in words)
     return f"{told['SLURM_ARRAY_JOB_ID']}_{told['SLURM_ARRAY_TASK_ID']}"
 
@@ -91,7 +92,7 @@ def test_time_limits_kills_and_lost_jobs_end_in_the_models_of_the_local_run(slur
         let_go_on_at_once(element_of(waiting[0]))
         os.kill(waiting[1], signal.SIGKILL)
         waiting = waiting_shards(driver, 4)
-        os.kill(parent_of(waiting[1]), signal.SIGKILL)  # the job's own process
+        os.kill(keeper_of(waiting[1]), signal.SIGKILL)  # the job's own process
         driver.wait_until_paused(5)
         driver.go_on()
         done = driver.finished()

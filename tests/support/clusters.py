@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from support.commands import PATIENCE_SECONDS, Command, do_tasks_here, vdgs
+from support.shard_server import parent_of, started
 from vdgs.runs.run_folder import RunFolder
 
 #: What makes a run of two blocks that is small enough to be trained again and again.
@@ -86,7 +87,8 @@ QUICK_STARTS = {
 class Cluster:
     """A Ray cluster; every node but the head has one processor."""
 
-    def __init__(self) -> None:
+    def __init__(self, variables: Mapping[str, str]) -> None:
+        """With environment variables of all its nodes."""
         #: With which a driver is let in; Ray listens on all addresses.
         self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         environment = os.environ | {
@@ -96,7 +98,7 @@ class Cluster:
             "RAY_health_check_failure_threshold": "2", "RAY_health_check_timeout_ms": "600000",
             "RAY_gcs_rpc_server_reconnect_timeout_s": "600",
             "RAY_memory_monitor_refresh_ms": "0",  # what other tests take is not for Ray to free
-            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **QUICK_STARTS, **self.token,
+            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **variables, **QUICK_STARTS, **self.token,
         }  # fmt: skip
         self._server = subprocess.Popen(
             [sys.executable, "-c", SERVER, str(PATIENCE_SECONDS)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -118,7 +120,7 @@ class Cluster:
 
     def node_of(self, process: int) -> str:
         """On which node a command of a block runs: its keeper is a child of the node's own process."""
-        return self._raylets[parent_of(parent_of(process))]
+        return self._raylets[parent_of(keeper_of(process))]
 
     def has(self, process: int, name: str) -> bool:
         """Whether a process of a block lives on a node; no if it is just being killed."""
@@ -148,13 +150,14 @@ class Cluster:
         raise AssertionError("the Ray cluster ended")
 
 
-def parent_of(process: int) -> int:
-    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+def keeper_of(process: int) -> int:
+    """The process that started that of a shard, or block."""
+    return parent_of(started(process))
 
 
 def shard_of(process: int) -> int:
     """Which shard, or block, a process does."""
-    words = Path(f"/proc/{process}/cmdline").read_bytes().decode().split("\0")
+    words = Path(f"/proc/{started(process)}/cmdline").read_bytes().decode().split("\0")
     return int(words[words.index("vdgs.distributed.run_shard") + 2])
 
 

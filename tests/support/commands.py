@@ -80,10 +80,10 @@ IMPORTED = [
     "sklearn.cluster",
     "rasterio",
 ]
-# Only Linux forks safely what has imported this much.
-_PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
+#: Begins processes. Only Linux forks safely what has imported this much.
+PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
 if sys.platform == "linux":
-    _PROCESSES.set_forkserver_preload(IMPORTED)
+    PROCESSES.set_forkserver_preload(IMPORTED)
 
 
 def begin_server(variables: Mapping[str, str]) -> str:
@@ -155,7 +155,7 @@ class Command:
     def __init__(self, main: Callable[[], None], folder: Path, pause: Pause, environment: dict[str, str]):
         self._main, self._pause = main, pause
         self._files = (folder / "stdout", folder / "stderr")
-        self._process = _PROCESSES.Process(target=_run, args=(main, *map(str, self._files), environment))
+        self._process = PROCESSES.Process(target=_run, args=(main, *map(str, self._files), environment))
         self._process.start()
 
     @property

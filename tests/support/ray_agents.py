@@ -1,7 +1,7 @@
 """Ray's nodes without what nothing here asks for, and as slow to start as the machine makes them.
 
-The two agents of every node serve dashboards and packages of environments; each takes half a second of processor time
-to start.
+The dashboard, and the two agents of every node, which serve it and packages of environments, take half a second of
+processor time each to start.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+#: Ray does without it where it ends.
+DASHBOARD = "dashboard/dashboard.py"
 #: For a program, the names of the ports that a node waits for. The last two are no agents: they scale clusters, and
 #: print elsewhere what is logged.
 PORTS: dict[str, tuple[str, ...]] = {
@@ -24,7 +26,10 @@ PORTS: dict[str, tuple[str, ...]] = {
 
 
 def stand_in_for_agents() -> None:
-    """If this process is to be an agent, say that it has no ports, wait for the end of its node, and end."""
+    """If this process is to be the dashboard, end. If it is to be an agent, say that it has no ports, wait for the end of
+    its node, and end."""
+    if any(word.endswith(f"/{DASHBOARD}") for word in sys.orig_argv[:4]):
+        os._exit(1)
     for program, names in PORTS.items():
         if any(word.endswith(f"/{program}") for word in sys.orig_argv[:4]):
             options = dict(word[2:].split("=", 1) for word in sys.orig_argv if word.startswith("--") and "=" in word)
