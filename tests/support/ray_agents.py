@@ -26,8 +26,8 @@ PORTS: dict[str, tuple[str, ...]] = {
 
 
 def stand_in_for_agents() -> None:
-    """If this process is to be the dashboard, end. If it is to be an agent, say that it has no ports, wait for the end of
-    its node, and end."""
+    """If this process is to be the dashboard, end. If it is to be an agent, say that it has no ports, wait for the end
+    of its node, and end."""
     if any(word.endswith(f"/{DASHBOARD}") for word in sys.orig_argv[:4]):
         os._exit(1)
     for program, names in PORTS.items():

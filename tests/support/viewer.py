@@ -220,6 +220,8 @@ class Browser:
     def __init__(self) -> None:
         command = browser()
         assert command is not None
+        #: Windows that no test uses.
+        self._free = list[str]()
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
             [
@@ -236,19 +238,22 @@ class Browser:
             raise
 
     @contextlib.contextmanager
-    def window(self, width: int, height: int) -> Iterator[Page]:
-        """An empty page that knows nothing of what other pages kept."""
+    def window(self) -> Iterator[Page]:
+        """An empty page that knows nothing of what other pages kept. Windows serve again: each takes a second of
+        processor time to open."""
         pages = self._address.partition("/devtools/")[0] + "/devtools/page/"
+        target = self._free.pop() if self._free else self._open_window()
+        with connect(pages + target, max_size=None) as own:
+            page = Page(own)
+            yield page
+            page.call("Page.navigate", url="about:blank")
+            page.call("Storage.clearDataForOrigin", origin="*", storageTypes="all")
+            page.call("Network.clearBrowserCache")
+        self._free.append(target)
+
+    def _open_window(self) -> str:
         with connect(self._address, max_size=None) as socket:
-            whole = Page(socket)
-            context = whole.call("Target.createBrowserContext")["browserContextId"]
-            size = {"width": width, "height": height, "newWindow": True}
-            target = whole.call("Target.createTarget", url="about:blank", browserContextId=context, **size)["targetId"]
-            try:
-                with connect(pages + target, max_size=None) as own:
-                    yield Page(own)
-            finally:
-                whole.call("Target.disposeBrowserContext", browserContextId=context)
+            return str(Page(socket).call("Target.createTarget", url="about:blank", newWindow=True)["targetId"])
 
     def close(self) -> None:
         self._process.terminate()
@@ -278,7 +283,7 @@ def open_page(
     that the page gives; `scale`: pixels of the screen for one of the page, the fewer the quicker it is drawn."""
     if not _browsers:
         _browsers.append(Browser())
-    with _browsers[0].window(width, height) as page:
+    with _browsers[0].window() as page:
         size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
         page.call("Emulation.setDeviceMetricsOverride", **size)
         if downloads is not None:
