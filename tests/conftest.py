@@ -14,9 +14,14 @@ import re
 import signal
 import sys
 from collections.abc import Generator
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+# What one process of the tests has compiled, the others find, also where the environment, as of a container, keeps
+# compiled code from being written.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -65,6 +70,7 @@ def pytest_configure_node(node: Any) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Heed the signals that tests send to commands, which inherit what `nohup` and shells in the background ignore."""
+    sys.dont_write_bytecode = False  # of this process, which began with the environment that is changed above
     if address := getattr(config, "workerinput", {}).get("commands"):
         from support.commands import use_server
 
@@ -75,14 +81,27 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
     """Import and collect without the garbage collector, and let it forget what was imported: stages call it often."""
     gc.disable()
     try:
+        if "PYTEST_XDIST_WORKER" in os.environ and session.config.args == session.config.getini("testpaths"):
+            import_share(session.config)
         return (yield)
     finally:
         gc.freeze()
         gc.enable()
+
+
+def import_share(config: pytest.Config) -> None:
+    """Let each worker import other test modules first: what it compiles (pytest rewrites all assertions), the others
+    find when they collect. What cannot be imported, collecting reports."""
+    worker, workers = int(config.workerinput["workerid"][2:]), config.workerinput["workercount"]  # type: ignore[attr-defined]
+    for file in sorted(Path(__file__).parent.rglob("test_*.py"))[worker::workers]:
+        if str(file.parent) not in sys.path:
+            sys.path.insert(0, str(file.parent))  # as pytest does
+        with suppress(Exception, pytest.skip.Exception):
+            import_module(file.stem)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
