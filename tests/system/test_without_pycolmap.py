@@ -48,14 +48,6 @@ def test_what_needs_pycolmap_names_it(capsys: pytest.CaptureFixture):
     assert "pip install pycolmap" in error
 
 
-def test_other_missing_packages_are_faults_of_the_program():
-    def action() -> None:
-        raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
-
-    with pytest.raises(ModuleNotFoundError):
-        exit_code_of("vdgs eval", action, "")
-
-
 def test_the_notices_name_what_can_be_left_out():
     text = (Path(__file__).parents[2] / "docs" / "third-party.md").read_text(encoding="utf-8")
     for name in REMOVABLE_PACKAGES:

@@ -9,6 +9,7 @@ import math
 import shutil
 import socket
 import sys
+import warnings
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -170,6 +171,20 @@ def test_visitors_that_vanish_are_forgotten(viewer):
     guests[3].close()
     wait_until(lambda: not viewer.sessions)
     assert not viewer.scheduler._sessions
+
+
+def test_what_is_sent_to_one_who_left_is_no_warning(run):
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with serve(open_run(run), "127.0.0.1", None, Console(file=io.StringIO())) as viewer:
+            guest = Guest(viewer.access.local_url())
+            guest.stand(above())
+            wait_until(lambda: viewer.sessions)
+            (visitor,) = viewer.sessions.values()
+            guest.vanish()
+            wait_until(lambda: not viewer.sessions)
+            visitor.set_progress("a picture that came too late")
+    assert not [each.message for each in said if "closed connection" in str(each.message)]
 
 
 @quiet

@@ -89,13 +89,14 @@ def _run_command(command: str, arguments: list[str]) -> int:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if os.environ.get("COLUMNS") == "0":  # no width is known; rich would print nothing
         del os.environ["COLUMNS"]
-    action = get_command(command)
     kept = command in RESUMABLE_COMMANDS and "--dry-run" not in arguments
     again = "continues: what is finished is kept" if kept else "begins it anew"
     fit = Advice(command, verb_arguments).fit
     token = MESSAGE_FIT.set(fit)
     try:
-        return exit_code_of(f"vdgs {command}", lambda: action(arguments), f"The same command {again}.", fit)
+        return exit_code_of(
+            f"vdgs {command}", lambda: get_command(command)(arguments), f"The same command {again}.", fit
+        )
     finally:
         MESSAGE_FIT.reset(token)
 

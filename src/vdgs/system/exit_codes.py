@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from vdgs.system.broken_packages import explain_broken_packages
+
 #: Required packages that an installation may leave out (`docs/third-party.md`), and what then does not work.
 REMOVABLE_PACKAGES = {
     "pycolmap": "photographs cannot become a capture, lenses cannot be undistorted, and vdgs synth cannot write its "
@@ -41,26 +43,32 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
     except BrokenPipeError:
         _forget_output()
         return 1
-    except ModuleNotFoundError as error:
-        if error.name not in REMOVABLE_PACKAGES:
+    except Exception as error:
+        if not (what := _explain(error)):
             raise
-        print(f"{name}: {error.name} is not installed: {REMOVABLE_PACKAGES[error.name]}", file=sys.stderr)
+        print(fit(f"{name}: {what}"), file=sys.stderr)
         return 1
-    except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
+
+
+def _explain(error: Exception) -> str:
+    """What an error of the machine or of the installation means, in words; empty for faults of the program."""
+    if isinstance(error, ModuleNotFoundError) and error.name in REMOVABLE_PACKAGES:
+        return f"{error.name} is not installed: {REMOVABLE_PACKAGES[error.name]}"
+    if broken := explain_broken_packages(error):
+        return broken
+    if isinstance(error, OSError):  # a disk that is full, a folder that cannot be written: no news from a traceback
         if not error.filename:
             _forget_output()
         what = error.filename or "a file, or what is printed"
-        print(f"{name}: {what}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)
-        return 1
-    except (MemoryError, RuntimeError) as error:
+        return f"{what}: {error.strerror or error}{_remedy(error)}"
+    if isinstance(error, MemoryError | RuntimeError):
         from vdgs.system.memory.process_memory import is_out_of_memory
 
-        if not is_out_of_memory(error):
-            raise
-        reason = str(error).strip().splitlines()[0] if str(error) else "no room"
-        remedy = "Smaller photographs (--downscale 2) or fewer --jobs need less."
-        print(fit(f"{name}: out of memory ({reason}). What was saved is kept. {remedy}"), file=sys.stderr)
-        return 1
+        if is_out_of_memory(error):
+            reason = str(error).strip().splitlines()[0] if str(error) else "no room"
+            remedy = "Smaller photographs (--downscale 2) or fewer --jobs need less."
+            return f"out of memory ({reason}). What was saved is kept. {remedy}"
+    return ""
 
 
 @contextmanager

@@ -51,8 +51,6 @@ def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], N
     """
     _require_viser()
     limit_malloc_arenas()
-    # Visitors may vanish while a picture is on its way to them.
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     find_free_port(request.host, request.port)  # said before the run is opened
     run = open_run_or_checkpoint(request.run, request.model, request.device)
     if run.warning:
@@ -136,6 +134,8 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     gc.collect()
     gc.freeze()
     trim_heap()  # what opening the run took beside what it left
+    # Visitors may vanish while a picture, or what is known of a place, is on its way to them.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     worker = threading.Thread(target=scheduler.run, name="render scheduler", daemon=True)
     worker.start()
     server.on_client_connect(on_connect)

@@ -10,6 +10,7 @@ from dataclasses import asdict
 
 from vdgs.cli.doctor import SystemCheck
 from vdgs.cli.doctor.system_checks import CHECKS
+from vdgs.system.broken_packages import broken_packages, import_reason, reinstall_command
 
 
 def run_checks() -> list[SystemCheck]:
@@ -20,7 +21,9 @@ def run_checks() -> list[SystemCheck]:
             checks += check()
         except Exception as error:  # the report must stand on a machine where anything may be broken
             name = getattr(check, "__name__", "check").strip("_")
-            checks.append(SystemCheck(name, "broken", f"{type(error).__name__}: {error}", "Reinstall vdgs.", True))
+            packages = broken_packages(error)
+            remedy = reinstall_command(packages) if packages else "Reinstall vdgs."
+            checks.append(SystemCheck(name, "broken", f"{type(error).__name__}: {import_reason(error)}", remedy, True))
     return checks
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
+from vdgs.system.broken_packages import import_reason, reinstall_command
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES
 from vdgs.system.memory.cgroups import cgroup_limits
 from vdgs.system.stop_signals import preserve_signal_handlers
@@ -56,11 +57,11 @@ def _dependencies() -> list[SystemCheck]:
     """The packages that vdgs requires are installed, and the binary ones can be imported."""
     required = [name for name in _required().get("", []) if name not in REMOVABLE_PACKAGES]
     absent = [name for name in required if _version(name) is None]
-    broken = [f"{name} ({error})" for name in BINARY_MODULES if (error := _import_error(name))]
+    broken = {name: error for name in BINARY_MODULES if (error := _import_error(name) or _numpy_error(name))}
     if absent or broken:
-        packages = " ".join(absent) or "--force-reinstall vdgs"
-        found = ", ".join([*(f"{name} is not installed" for name in absent), *broken])
-        return [SystemCheck("dependencies", "broken", found, f"pip install {packages}", True)]
+        remedy = f"pip install {' '.join(absent)}" if absent else reinstall_command(tuple(broken))
+        found = [f"{name} is not installed" for name in absent] + [f"{name} ({why})" for name, why in broken.items()]
+        return [SystemCheck("dependencies", "broken", ", ".join(found), remedy, True)]
     return [SystemCheck("dependencies", "ok", "all installed, all can be imported", essential=True)]
 
 
@@ -254,7 +255,18 @@ def _import_error(module: str) -> str:
         with preserve_signal_handlers():
             importlib.import_module(module)
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        return f"{type(error).__name__}: {import_reason(error)}"
+    return ""
+
+
+def _numpy_error(module: str) -> str:
+    """Why torch does not know numpy's arrays: it was built for another version. Not said when it is imported."""
+    if module != "torch":
+        return ""
+    try:
+        importlib.import_module("torch").from_numpy(importlib.import_module("numpy").zeros(1))
+    except Exception as error:
+        return f"{type(error).__name__}: {import_reason(error)}"
     return ""
 
 
