@@ -352,6 +352,28 @@ def test_an_ellipsoid_without_a_datum_is_said_to_be_none(tmp_path, more, is_said
     assert ("no datum: taken as WGS 84" in to_geodetic(system, tmp_path)[1]) == is_said
 
 
+@pytest.mark.parametrize(
+    ("system", "x", "y", "error_m", "said"),
+    [
+        ("EPSG:31467", 3500000, 5400000, 3, "converted from DHDN to WGS 84, good to 3 m"),
+        ("EPSG:27700", 450000, 250000, 2, "good to 2 m"),
+        ("EPSG:2434", 500000, 3400000, 300, "knows no shift from Beijing 1954"),
+        ("+proj=utm +zone=33 +ellps=bessel", 500000, 5400000, 300, "no datum: taken as WGS 84"),
+        ("+proj=utm +zone=33 +ellps=bessel +towgs84=598,73,418", 500000, 5400000, 0, ""),
+        ("EPSG:25832", 500000, 5400000, 0, ""),
+        ("EPSG:6344", 500000, 4400000, 0, ""),
+        ("EPSG:4513", 38500000, 3400000, 0, ""),  # CGCS2000
+        ("EPSG:32632", 500000, 5400000, 0, ""),
+    ],
+)
+def test_what_a_national_datum_costs_is_stated(tmp_path, system, x, y, error_m, said):
+    (tmp_path / "geo.txt").write_text(f"{system}\na.jpg {x} {y} 500\nb.jpg {x + 30} {y} 500\n")
+    table = read_gps_table(tmp_path / "geo.txt")
+    assert table.datum_error_m == pytest.approx(error_m, abs=1)
+    assert any(said in note for note in table.notes) if said else not any("datum" in each for each in table.notes)
+    assert sum("WGS 84" in note for note in table.notes) == bool(said)
+
+
 @pytest.mark.parametrize("altitude", [0.0, None])
 def test_altitudes_that_are_all_zero_are_a_default(tmp_path, altitude):
     seen = photographs(tmp_path, NAMES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,16 @@ from support.metashape_files import (
     metashape_xml,
     write_project,
 )
-from support.true_flight import ORIGIN, SIZE, Lens, TrueFlight, assert_read_or_refused, assert_true, true_flight
+from support.true_flight import (
+    ORIGIN,
+    SIZE,
+    Lens,
+    TrueFlight,
+    assert_read_or_refused,
+    assert_true,
+    true_flight,
+    words,
+)
 from vdgs.captures.formats.lens_projection import pixel_rays, ray_pixels
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture
 from vdgs.captures.loading import read_files
@@ -88,6 +98,40 @@ def test_local_coordinates_are_metres_with_z_up(tmp_path):
     source = read(tmp_path, metashape_xml(flight, reference=LOCAL), flight)
     assert_true(source, flight)
     assert source.georef.origin is None
+
+
+FEET = 'LOCAL_CS["Local Coordinates (ft)",LOCAL_DATUM["Local Datum",0],UNIT["US survey foot",0.304800609601219]]'
+
+
+@pytest.mark.parametrize("poses_in_feet", [False, True, None])
+def test_local_coordinates_in_feet_are_metres_by_what_references_show(tmp_path, poses_in_feet):
+    flight, feet = true_flight(), 0.304800609601219
+    xml = metashape_xml(flight, reference=FEET, transform=metashape_transform(LOCAL))
+    for center in flight.centers if poses_in_feet is not None else ():
+        x, y, z = center / feet + [100, 200, 0]
+        xml = xml.replace('<reference x="11.9" y="48.1" z="640"', f'<reference x="{x}" y="{y}" z="{z}"', 1)
+    if poses_in_feet is None:
+        xml = xml.replace('<reference x="11.9" y="48.1" z="640" enabled="1"/>', "")
+    if poses_in_feet:
+        scale, translation = (re.search(f"<{name} .*?>(.*?)</{name}>", xml)[1] for name in ("scale", "translation"))
+        xml = xml.replace(translation, words(np.fromstring(translation, sep=" ") / feet), 1)
+        xml = xml.replace(f">{scale}<", f">{float(scale) / feet!r}<", 1)
+    source = read(tmp_path, xml, flight)
+    assert_true(source, flight)
+    (said,) = (each for each in source.warnings if "US survey foot" in each)
+    assert ("taken as US survey foot" in said) == bool(poses_in_feet)
+    assert ("nothing in the file shows" in said) == (poses_in_feet is None)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "gb18030", "shift_jis", "cp1252"])
+def test_exports_in_other_encodings(tmp_path, encoding):
+    flight = true_flight(count=6)
+    declared = "UTF-16" if encoding.startswith("utf-16") else encoding
+    xml = metashape_xml(flight).replace("UTF-8", declared)
+    flight.touch(tmp_path)
+    (tmp_path / "cameras.xml").write_bytes(xml.encode(encoding))
+    (tmp_path / "markers.xml").write_bytes('<document version="2.0.0"><chunk/></document>'.encode(encoding))
+    assert_true(read_project(tmp_path, "metashape", OPTIONS, needs_points=False), flight)
 
 
 def test_a_chunk_without_transform_has_the_shape_alone(tmp_path):

@@ -311,6 +311,19 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     assert read_reconstruction(tmp_path / "capture") == facts
 
 
+def test_a_national_datum_counts_in_the_place_of_control_points(made, flight, points, tmp_path):
+    """Chile's PSAD56 leads to WGS 84 by a shift that is good to 17 m."""
+    stated = {}
+    for system in ("EPSG:32719", "EPSG:24879"):
+        (tmp_path / system).mkdir()
+        listed = write_list(tmp_path / system / "gcp_list.txt", flight, points, system)
+        facts, _, said = surveyed(made, flight, tmp_path / system, listed)
+        stated[system] = facts.accuracy.place_m[0]
+        assert ("converted from PSAD56 to WGS 84, good to 17 m" in said) is (system == "EPSG:24879")
+    assert stated["EPSG:24879"] == pytest.approx(np.hypot(stated["EPSG:32719"], 17), abs=0.1)
+    assert stated["EPSG:32719"] < 1
+
+
 def test_control_points_without_heights_count_in_the_plane(made, flight, points, tmp_path):
     """Of some points; of all, whose model then lies as high as GPS says, upright by the attitudes."""
     file = write_list(tmp_path / "gcp_list.txt", flight, points)

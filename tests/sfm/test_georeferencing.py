@@ -133,6 +133,24 @@ def test_heights_of_a_barometer_are_as_high_above_the_sea_as_altitudes_tell(drif
         assert off > 0.3 * drift_m
 
 
+def test_a_datum_counts_in_the_place_as_far_as_its_positions_are_used():
+    places = strips(6, 6, 20.0, np.random.default_rng(0))
+    recorded = places + np.random.default_rng(1).normal(0, 1.0, places.shape)
+    recorded[7] += [250, 0, 0]  # of a datum that PROJ does not know
+    fit = fit_positions(problem_of(places, recorded, 0)[0])
+    assert not fit.inliers[7]
+    used = np.flatnonzero(fit.inliers)
+    for errors, share in (
+        (300.0 * (np.arange(36) == 7), 0), (300.0 * (np.arange(36) == used[3]), 1 / len(used)), (np.full(36, 300.0), 1),
+    ):  # fmt: skip
+        positions = GpsPriors(
+            image_indices=np.arange(36), enu=recorded, gps_std=np.ones((36, 3)), origin=(0.0, 0.0, 0.0),
+            altitude_reference="", source="EXIF", notes=(), datum_errors_m=errors,
+        )  # fmt: skip
+        across, _ = georegistration._place_error(fit, None, positions, np.arange(36))
+        assert across == pytest.approx(np.hypot(fit.place_error_m[0], 300 * share))
+
+
 @pytest.mark.parametrize("datum_m", [0.0, 20.0, 48.0])
 @pytest.mark.parametrize("flown", ["beside each other", "over each other"])
 def test_altitudes_of_flights_that_differ_by_a_datum_tilt_nothing_and_are_said(datum_m, flown):

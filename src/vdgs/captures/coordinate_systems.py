@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import geodetic_from_ecef
+from vdgs.geometry.geodesy import FLATTENING, SEMI_MAJOR_M, geodetic_from_ecef
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 _STARTS = re.compile(
@@ -25,6 +25,10 @@ _AROUND = " \t\r\n,;'\""
 _ONE_PLACE = 0.2
 #: What is said of systems in feet, where nothing says the unit of heights.
 HEIGHTS_IN_METERS = "; x and y in feet, heights are taken as metres"
+#: National datums of which nothing more is known differ from WGS 84 by up to so many metres.
+UNKNOWN_DATUM_M = 300.0
+#: A datum that moves places by less (degrees) is WGS 84 for PROJ.
+_SAME_DEG = 1e-8
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
 _GLOBAL = {"WGS 84", "GRS 1980"}
 #: ODM's words for the zones of UTM, and those that people write in their place.
@@ -92,6 +96,40 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
         )
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
     return changed, f"{name}{HEIGHTS_IN_METERS}" if feet else name
+
+
+def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float, str]:
+    """By how many metres places (latitude, longitude, height) may be off that `to_geodetic` brought to WGS 84 from the
+    datum of their system, and that in words; 0 and none for datums that are WGS 84 but for a metre or two, and for
+    shifts that the header gives itself."""
+    import pyproj
+
+    crs = pyproj.CRS.from_user_input(_named(header))
+    if crs.is_bound or crs.geodetic_crs is None or not len(geodetic):
+        return 0.0, ""
+    datum, (latitude, longitude) = crs.geodetic_crs.to_2d(), np.median(geodetic[:, :2], axis=0).tolist()
+    if datum.is_geocentric:
+        datum = pyproj.crs.GeographicCRS(datum=datum.datum)
+    near: Any = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
+    with warnings.catch_warnings():  # of grids that are not at hand: another way is taken
+        warnings.simplefilter("ignore", UserWarning)
+        ways = pyproj.transformer.TransformerGroup(datum, "EPSG:4326", always_xy=True, area_of_interest=near)
+    way = ways.transformers[0] if ways.transformers else None
+    if way is None or way.accuracy < 0:
+        shape = datum.ellipsoid
+        off = (shape.semi_major_metre - SEMI_MAJOR_M, shape.inverse_flattening - 1 / FLATTENING) if shape else (9, 9)
+        if abs(off[0]) < 1 and abs(off[1]) < 0.01:
+            return 0.0, ""
+        if datum.name == "unknown":  # `to_geodetic` says so
+            return UNKNOWN_DATUM_M, ""
+        return UNKNOWN_DATUM_M, (
+            f"PROJ knows no shift from {datum.name} to WGS 84 there: taken as of WGS 84 (may be off by "
+            f"{UNKNOWN_DATUM_M:.0f} m)"
+        )
+    moved = np.abs(np.subtract(way.transform(longitude, latitude), (longitude, latitude))).max()
+    if moved < _SAME_DEG or way.accuracy == 0:
+        return 0.0, ""
+    return float(way.accuracy), f"converted from {datum.name} to WGS 84, good to {way.accuracy:.2g} m"
 
 
 def look_like_degrees(places: np.ndarray) -> bool:

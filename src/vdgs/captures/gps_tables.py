@@ -19,6 +19,7 @@ import numpy as np
 from vdgs.captures.angles import degrees_of_text
 from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
+    datum_error,
     in_units_of,
     look_like_degrees,
     names_a_system,
@@ -76,6 +77,8 @@ class GpsTable:
     numbered: bool = False
     """Whether rows are of the first, second, ... photograph, not of one by its name."""
     notes: tuple[str, ...] = ()
+    datum_error_m: float = 0.0
+    """How far all its places may be off by the datum of its system."""
 
 
 class _Columns(NamedTuple):
@@ -137,9 +140,13 @@ def read_gps_table(file: Path) -> GpsTable:
     system = system if columns.altitude_unit == 1 else system.removesuffix(HEIGHTS_IN_METERS)
     if doubt := system.partition("; ")[2]:
         notes.append(f"{file.name}: {doubt}.")
+    datum_error_m, converted = 0.0, ""
+    if columns.system is not None:
+        datum_error_m, converted = datum_error(columns.system, np.array(positions))
+    notes += [f"{file.name}: positions are {converted}; maps in its own system are not."] if converted else []
     if len(placed) < len(rows):
         notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
-    return GpsTable(tuple(found), notes=tuple(notes))
+    return GpsTable(tuple(found), notes=tuple(notes), datum_error_m=datum_error_m)
 
 
 def _after_colon(text: str) -> str:

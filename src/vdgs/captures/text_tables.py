@@ -51,14 +51,15 @@ def read_lines(file: Path, what: str = "table of photographs") -> list[Line]:
         data = file.read_bytes()
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
-    text = _decoded(data)
+    text = decode_text(data)
     if "\x00" in text:
         raise CaptureError(f"{file}: is not a text file. A {what} is expected; save a spreadsheet as CSV.")
     lines = [Line(k, line.strip(" \r")) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
     return lines[1:] if lines and _EXCEL.fullmatch(lines[0].text) else lines
 
 
-def _decoded(data: bytes) -> str:
+def decode_text(data: bytes) -> str:
+    """A text in UTF-8, UTF-16 or Windows' Latin, as programs on Windows write it."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     head = data[:400]

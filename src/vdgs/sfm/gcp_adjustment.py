@@ -208,6 +208,9 @@ def adjust_to_gcps(
         notes = ("too few control points with heights fit the others to bend the model; it is not bent.",)
     else:
         model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in firm], fix_focal, threads)
+    if accuracy.place_m:
+        with_datum = float(np.hypot(accuracy.place_m[0], gcps.datum_error_m))
+        accuracy = replace(accuracy, place_m=(with_datum, *accuracy.place_m[1:]))
     doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
     return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
 

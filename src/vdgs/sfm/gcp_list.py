@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, in_units_of, to_geodetic
+from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, datum_error, in_units_of, to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.captures.table_columns import NO_DATA, UNKNOWN, known_columns, meters_of, number_of
@@ -66,6 +66,8 @@ class GcpList:
     """The coordinate system that the file names."""
     source: str
     notes: tuple[str, ...]
+    datum_error_m: float = 0.0
+    """How far all points may be off by the datum of their system."""
 
     @property
     def has_control_points(self) -> bool:
@@ -138,7 +140,9 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
         strange = [*strange, f"{file.name}: {said}"]
     if any(name.startswith(CHECK_PREFIX) for name in names):
         strange = [*strange, f"{file.name}: points named {CHECK_PREFIX}... are held out as check points, as in ODM."]
-    return _checked(points, system, file, strange)
+    error_m, converted = datum_error(header, np.array([point.geodetic for point in points]))
+    strange = [*strange, f"{file.name}: points are {converted}."] if converted else strange
+    return replace(_checked(points, system, file, strange), datum_error_m=error_m)
 
 
 def _of_photographs(

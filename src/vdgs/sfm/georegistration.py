@@ -183,9 +183,11 @@ def _without_offsets(
 def _place_error(
     fit: PositionFit, offsets: AltitudeOffsets | None, positions: GpsPriors, rows: np.ndarray
 ) -> tuple[float, float]:
-    """Place across and up: all places have the error of their datum, and all altitudes may be rounded the same way. Of
-    two flights nothing says whose altitudes are right, unless one alone states the accuracy of RTK."""
-    across, up = np.hypot(fit.place_error_m, (positions.datum_error_m, positions.altitude_step_m)).tolist()
+    """Place across and up: positions move it by the error of their datums as far as they are used, and all altitudes
+    may be rounded the same way. Of two flights nothing says whose altitudes are right, unless one alone states the
+    accuracy of RTK."""
+    datums = positions.datum_errors_m[rows][fit.inliers] if len(positions.datum_errors_m) else np.zeros(1)
+    across, up = np.hypot(fit.place_error_m, (datums.mean(), positions.altitude_step_m)).tolist()
     if offsets is None:
         return across, up
     up_std = positions.gps_std[rows, 2]

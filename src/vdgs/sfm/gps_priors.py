@@ -59,8 +59,8 @@ class GpsPriors:
     """False where most positions have none: then heights here are 0, and positions count in the plane alone."""
     flights: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Numbers [m] of the flights of the positions, whose altitudes may differ by a datum; empty where none is told."""
-    datum_error_m: float = 0.0
-    """How far all places may be off by the datum that the photographs name."""
+    datum_errors_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """How far each may be off [m] by the datum that it was of; empty where all are of WGS 84."""
     altitude_step_m: float = 0.0
     """What altitudes are rounded to; 0 where that is not seen."""
 
@@ -91,6 +91,8 @@ class _Recorded:
     notes: list[str]
     rows: Mapping[int, GpsRow]
     """Rows of a table by the photographs that they are of."""
+    datum_error_m: float = 0.0
+    """How far all places of a table may be off by its datum."""
 
 
 def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, std_m: tuple[float, float]) -> GpsPriors:
@@ -148,7 +150,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         has_altitudes=has_altitudes,
         flights=flights,
         altitude_step_m=step,
-        datum_error_m=max((photo.datum_error_m for photo in taken if table is None), default=0.0),
+        datum_errors_m=np.array([photo.datum_error_m if table is None else recorded.datum_error_m for photo in taken]),
     )
 
 
@@ -194,7 +196,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
     if without:
         chosen = np.isin(np.arange(len(names)), without)
         notes.append(f"{table.name} gives no altitude for {_some(names, chosen)}; as the photographs say it.")
-    return _Recorded(geodetic, kinds, table.name, notes, rows)
+    return _Recorded(geodetic, kinds, table.name, notes, rows, read.datum_error_m)
 
 
 def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageMetadata]) -> _Recorded:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
+from vdgs.captures.coordinate_systems import UNKNOWN_DATUM_M
 from vdgs.sfm.exif_gps import Place, plain_text
 
 #: Datums that agree with WGS 84 to a metre or two.
@@ -18,8 +19,8 @@ _GLOBAL = re.compile(
     re.I,
 )
 _NOTHING = re.compile(r"unknown|undefined|none|n/?a|null|0*|-*", re.I)
-#: National datums differ from WGS 84 by up to so many metres, and China's maps, which are shifted on purpose.
-UNKNOWN_M, _SHIFTED = 300.0, ((re.compile(r"GCJ", re.I), 700.0), (re.compile(r"BD[-_ ]?09|BAIDU", re.I), 1300.0))
+#: China's maps are shifted on purpose, by up to so many metres.
+_SHIFTED = ((re.compile(r"GCJ", re.I), 700.0), (re.compile(r"BD[-_ ]?09|BAIDU", re.I), 1300.0))
 #: Words of cameras in place of PROJ's names.
 _NAMES = (
     (r"S[K]?[-_ ]*(19)?42\b|KRASS?OWSK[IY]|PULKOVO.*", "Pulkovo 1942"), (r"POTSDAM", "DHDN"), (r"TOKYO.*", "Tokyo"),
@@ -40,15 +41,15 @@ def to_wgs84(place: Place, gps: Mapping[int, Any]) -> tuple[Place, str, float]:
     try:
         found = None if shifted else _way(named, round(place[0]), round(place[1]))
     except ImportError:
-        return place, f"{_of(datum, UNKNOWN_M)}; pip install 'vdgs[geo]' converts it", UNKNOWN_M
+        return place, f"{_of(datum, UNKNOWN_DATUM_M)}; pip install 'vdgs[geo]' converts it", UNKNOWN_DATUM_M
     if found is None:
-        error_m = shifted or UNKNOWN_M
+        error_m = shifted or UNKNOWN_DATUM_M
         remedy = "a table of positions, --gps, whose first line names the system, mends it"
         return place, f"{_of(datum, error_m)}; {remedy}", error_m
     change, error_m = found
     longitude, latitude = change.transform(place[1], place[0])
     if not math.isfinite(latitude + longitude):  # beside a grid
-        return place, _of(datum, UNKNOWN_M), UNKNOWN_M
+        return place, _of(datum, UNKNOWN_DATUM_M), UNKNOWN_DATUM_M
     return (latitude, longitude), f"positions are of the datum {datum}: converted (good to {error_m:.2g} m)", error_m
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from vdgs.captures.formats.source_capture import BROWN, BadPose, Intrinsics, check_intrinsics
 from vdgs.captures.image_files import read_header
+from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
@@ -21,7 +22,7 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 def read_capture_json(file: Path) -> JsonObject:
     """The object in a JSON file. Raises `CaptureError` for anything else."""
     try:
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
+        content = json.loads(decode_text(file.read_bytes()))
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     except (ValueError, RecursionError) as error:

@@ -9,8 +9,9 @@ and depth maps is not used.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +43,8 @@ _FISHEYES = ("fisheye", "equidistant_fisheye", _EQUISOLID)
 _UNUSED = ("frames", "markers", "shapes", "region", "depth_maps_sets")
 #: A chunk without a coordinate system whose origin is so far from that of its transform is on the globe (metres).
 _ON_GLOBE_M = (SEMI_MAJOR_M - 60_000, SEMI_MAJOR_M + 60_000)
+#: The unit of a local coordinate system and the metres in one.
+_UNIT = re.compile(r"\bUNIT\[\s*\"([^\"]+)\"\s*,\s*([\d.eE+-]+)")
 _FALSE = ("0", "false")
 
 
@@ -304,13 +307,50 @@ class _Chunk:
 
     @cached_property
     def _transforms(self) -> dict[str, Similarity]:
-        """From each component to the world, and from the chunk ("") in files of versions that know no components."""
+        """From each component to the world, in metres, and from the chunk ("") in files of versions that know no
+        components."""
         found = {}
         for component in [*self._element.iter("component"), self._element]:
             transform = component.find("transform")
             if transform is not None:
                 found[component.get("id", "") if component is not self._element else ""] = self._similarity(transform)
-        return found
+        meters = self._meters_per_unit(found)
+        return {
+            key: Similarity(meters * each.scale, each.rotation, meters * each.translation)
+            for key, each in found.items()
+        }
+
+    def _meters_per_unit(self, transforms: Mapping[str, Similarity]) -> float:
+        """What the transforms count in where local coordinates are of another unit than metres: metres as everywhere
+        in Metashape, unless the cameras' references, which are in the unit, say that they count in it, too."""
+        unit = _UNIT.search(self._wkt) if is_local_system(self._wkt) else None
+        meters = float(unit[2]) if unit is not None else 1.0
+        if unit is None or not meters > 0 or abs(meters - 1) < 1e-3:
+            return 1.0
+        places, references = [], []
+        for camera in self._element.iter("camera"):
+            pose, reference = camera.find("transform"), camera.find("reference")
+            number = camera.get("component_id", "")
+            key = number if number in transforms else next(iter(transforms), "")
+            words = [reference.get(axis, "") for axis in "xyz"] if reference is not None else []
+            if pose is not None and key in transforms and words and all(words):
+                label = f"camera {camera.get('label', '?')!r}"
+                matrix = xml_numbers(pose.text, 16, self._file, f"the transform of {label}")
+                places.append(transforms[key].apply(np.array(matrix[3:12:4])))
+                references.append(xml_numbers(" ".join(words), 3, self._file, f"the reference of {label}"))
+        spread = [float(np.sqrt(np.var(each, axis=0).sum())) if len(each) > 2 else 0.0 for each in (places, references)]
+        ratio = spread[1] / spread[0] if min(spread) > 0 else 0.0
+        counts_in_unit = bool(ratio and abs(np.log(ratio)) < abs(np.log(ratio * meters)))
+        why = "as the references of its cameras show" if ratio else "which nothing in the file shows"
+        taken = unit[1] if counts_in_unit else "metres"
+        self._warnings.append(f"its local coordinates are in {unit[1]}; its poses are taken as {taken}, {why}.")
+        return meters if counts_in_unit else 1.0
+
+    @property
+    def _wkt(self) -> str:
+        """The coordinate system of the chunk; empty where it names none."""
+        reference = next((each for each in self._element.findall("reference") if (each.text or "").strip()), None)
+        return (reference.text or "").strip() if reference is not None else ""
 
     def _component(self, camera: _Camera) -> str:
         number = camera.component
@@ -357,8 +397,7 @@ class _Chunk:
     def _system(self, chunk: Similarity) -> tuple[ToGeodetic | None, str, tuple[CloudFrame, ...]]:
         """What brings the world to latitude, longitude and height, how that is called, and what a point cloud beside
         the export may be in."""
-        reference = next((each for each in self._element.findall("reference") if (each.text or "").strip()), None)
-        wkt = (reference.text or "").strip() if reference is not None else ""
+        wkt = self._wkt
         on_globe = _ON_GLOBE_M[0] < float(np.linalg.norm(chunk.translation)) < _ON_GLOBE_M[1]
         if (not wkt and not on_globe) or is_local_system(wkt):
             return None, "Metashape, local coordinates", (("of the chunk", chunk.apply),)

@@ -22,6 +22,7 @@ from vdgs.captures.formats.json_poses import parse_number, parse_vector, read_ca
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.gps_tables import check_geodetic
+from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.crs import utm_epsg
@@ -63,7 +64,7 @@ def is_file(file: Path) -> bool:
         return False
     try:
         with file.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES).lstrip(b"\xef\xbb\xbf \t\r\n")
+            head = decode_text(stream.read(_HEAD_BYTES)).lstrip().encode()
     except OSError:
         return False
     if file.suffix == ".geojson":
@@ -135,7 +136,7 @@ def _is_shifted(reconstruction: JsonObject, project: Path, shift: np.ndarray) ->
 def _biggest(file: Path) -> tuple[JsonObject, list[str]]:
     """The reconstruction of most photographs in a file, and a warning that names the photographs of the others."""
     try:
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
+        content = json.loads(decode_text(file.read_bytes()))
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     except (ValueError, RecursionError) as error:

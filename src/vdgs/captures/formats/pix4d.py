@@ -17,10 +17,11 @@ from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import xml_numbers
+from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
-_ENDING, _HEADER = "_calibrated_camera_parameters.txt", b"fileName imageWidth imageHeight"
+_ENDING, _HEADER = "_calibrated_camera_parameters.txt", "fileName imageWidth imageHeight"
 #: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
 _FOLDERS = ("params", "1_initial/params")
 _LINES = 10
@@ -38,7 +39,7 @@ def is_file(file: Path) -> bool:
         return False
     try:
         with file.open("rb") as stream:
-            return stream.read(len(_HEADER)) == _HEADER
+            return decode_text(stream.read(4 * len(_HEADER))).startswith(_HEADER)
     except OSError:
         return False
 
@@ -46,7 +47,7 @@ def is_file(file: Path) -> bool:
 def read(file: Path, options: CaptureOptions) -> Project:
     """The calibrated cameras of a project. Raises `CaptureError` for damaged files and fisheyes."""
     try:
-        lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+        lines = decode_text(file.read_bytes()).splitlines()
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     head = next((index for index, line in enumerate(lines) if line.startswith("camera model")), None)
@@ -108,6 +109,6 @@ def _system(file: Path) -> tuple[ToGeodetic | None, str, bool, tuple[CloudFrame,
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8-sig", errors="replace")
+        return decode_text(file.read_bytes())
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error

@@ -27,6 +27,7 @@ from vdgs.captures.formats.photograph_sizes import name_unaligned, photograph_si
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
+from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -45,7 +46,7 @@ _ALIASES = {
 #: The models of the XMP that are Brown's, all in the order k1, k2, k3, k4, t1, t2.
 _BROWN_MODELS = {"", "perspective", "brown3", "brown4", "brown3t2", "brown4t2"}
 #: Bytes in which the line that names the columns is looked for, and the namespace of the XMP.
-_HEAD_BYTES, _NAMESPACE = 1024, b"capturingreality.com/ns/xcr"
+_HEAD_BYTES, _NAMESPACE = 1024, "capturingreality.com/ns/xcr"
 #: No camera of a survey has a longer focal length, in millimetres as of 35 mm film.
 _LONGEST_35MM = 1500.0
 #: XMP files that are looked at to tell whether they are RealityScan's: other programs write thousands.
@@ -178,7 +179,7 @@ def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
     """The projected system that the information beside a point cloud or a model in the folder names."""
     for info in sorted(file.parent.glob(_INFO)):
         try:
-            found = _SYSTEM.search(info.read_text(encoding="utf-8-sig", errors="replace"))
+            found = _SYSTEM.search(decode_text(info.read_bytes()))
         except OSError as error:
             raise CaptureError(
                 f"{info}: names the coordinate system of the export, and cannot be read ({error.strerror or error}). "
@@ -193,7 +194,7 @@ def _is_table(file: Path) -> bool:
     """Whether a file begins with the columns of registered cameras."""
     try:
         with file.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
+            head = decode_text(stream.read(_HEAD_BYTES))
     except OSError:
         return False
     return any(_column_names(line) is not None for line in head.splitlines()[:3])
@@ -216,8 +217,8 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
     """Raises `CaptureError` for a row with too few columns or with what is no number, and for one without a focal
     length; all such rows at once."""
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = decode_text(file.read_bytes()).splitlines()
+    except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error}). {_AGAIN}") from None
     start, found = next(
         ((k, each) for k, each in enumerate(map(_column_names, lines[:3])) if each is not None), (0, None)
@@ -283,7 +284,7 @@ def _xmp_below(folder: Path, deep: bool = True) -> list[Path]:
 def _is_xmp(file: Path) -> bool:
     try:
         with file.open("rb") as stream:
-            return _NAMESPACE in stream.read(4 * _HEAD_BYTES)
+            return _NAMESPACE in decode_text(stream.read(4 * _HEAD_BYTES))
     except OSError:
         return False
 

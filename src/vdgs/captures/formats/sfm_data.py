@@ -20,6 +20,7 @@ from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending, holds
+from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -217,7 +218,7 @@ def _head(file: Path, *texts: bytes) -> bool:
         return False
     try:
         with file.open("rb") as stream:
-            head = stream.read(1 << 16)
+            head = decode_text(stream.read(1 << 16)).encode()
     except OSError:
         return False
     return all(text in head for text in texts)

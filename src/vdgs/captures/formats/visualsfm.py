@@ -17,6 +17,7 @@ from vdgs.captures.formats.photograph_sizes import photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending
+from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -32,7 +33,7 @@ def is_file(file: Path) -> bool:
         return False
     try:
         with file.open("rb") as stream:
-            return stream.read(len(_HEADER)) == _HEADER.encode()
+            return decode_text(stream.read(4 * len(_HEADER))).startswith(_HEADER)
     except OSError:
         return False
 
@@ -44,7 +45,7 @@ def find_files(root: Path) -> list[Path]:
 def read(file: Path, options: CaptureOptions) -> Project:
     """The first model of a file, which is the biggest. Raises `CaptureError` for damaged files."""
     try:
-        lines = [line.strip() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]
+        lines = [line.strip() for line in decode_text(file.read_bytes()).splitlines()]
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     header, lines = lines[0].split() if lines else [], [line for line in lines[1:] if line and line[0] != "#"]

@@ -3,6 +3,7 @@ size."""
 
 from __future__ import annotations
 
+import codecs
 import math
 import os
 import re
@@ -11,7 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, cast
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
@@ -24,6 +25,9 @@ _ZIPPED, _DOCUMENT = (".xmlz", ".zip", ".psz"), "doc.xml"
 #: Elements lie in no more others than this; text and attributes of one are no longer than this.
 MAX_DEPTH, MAX_TEXT = 64, 1 << 24
 _DECLARATION = re.compile(rb"^\s*(\xef\xbb\xbf)?<\?xml[^>]*\?>")
+_ENCODING = re.compile(rb"^\s*<\?xml[^>]*\bencoding\s*=\s*[\"']([\w.-]+)")
+#: Encodings of Chinese, Japanese and Korean, by how their names begin.
+_OF_SEVERAL_BYTES = ("gb", "big5", "shift", "sjis", "euc", "iso-2022", "cp93", "cp94", "cp950", "ms932", "ks_c")
 _ROOT = re.compile(r"<(?:\w+:)?([A-Za-z_][\w.-]*)[\s/>]")
 
 
@@ -42,9 +46,7 @@ def root_element(file: Path) -> str:
             head = stream.read(HEAD_BYTES)
     except (OSError, CaptureError):
         return ""
-    text = head.decode("utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8", "replace").lstrip(
-        "\ufeff \r\n\t"
-    )
+    text = head.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
     found = _ROOT.search(text) if text.startswith("<") else None
     return found[1] if found else ""
 
@@ -64,10 +66,11 @@ def holds(file: Path, *texts: bytes) -> bool:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[IO[bytes]]:
-    """The bytes of a file, or of the first XML file in it where it is a zip."""
+    """A file, or the first XML file in it where it is a zip; in UTF-8 if it is in UTF-16, or in an encoding of several
+    bytes, which expat does not know."""
     with file.open("rb") as plain:
         if file.suffix.lower() not in _ZIPPED:
-            yield plain
+            yield _in_utf8(plain)
             return
         try:
             with zipfile.ZipFile(plain) as archive:
@@ -75,9 +78,32 @@ def _opened(file: Path) -> Iterator[IO[bytes]]:
                 if not names:
                     raise CaptureError(f"{file}: holds no XML file.")
                 with archive.open(_DOCUMENT if _DOCUMENT in names else names[0]) as stream:
-                    yield stream
+                    yield _in_utf8(stream)
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error, EOFError) as error:
             raise CaptureError(f"{file}: is no zip file that can be read ({error}). Copy it again.") from None
+
+
+def _in_utf8(stream: IO[bytes]) -> IO[bytes]:
+    head = stream.read(HEAD_BYTES)
+    stream.seek(0)
+    zeros = [place for place in (0, 1) if head[place : place + 1] == b"\0"]
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif zeros:  # without a mark: `<` has a zero before or behind it
+        encoding = "utf-16-le" if zeros == [1] else "utf-16-be"
+    else:
+        named = _ENCODING.search(head)
+        encoding = named[1].decode("ascii").lower() if named else ""
+        if not encoding.startswith(_OF_SEVERAL_BYTES) or not _is_known(encoding):
+            return stream
+    return cast(IO[bytes], codecs.EncodedFile(cast(Any, stream), "utf-8", encoding, "replace"))
+
+
+def _is_known(encoding: str) -> bool:
+    try:
+        return bool(codecs.lookup(encoding))
+    except LookupError:
+        return False
 
 
 def read_xml(
@@ -99,22 +125,27 @@ class _Reader:
         self._text = 0
 
     def read(self, fragment: bool) -> Element:
-        parser = expat.ParserCreate()
-        parser.buffer_text = True
-        parser.StartElementHandler, parser.EndElementHandler = self._start, self._end
-        parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = self._data, self._refuse
         try:
             with _opened(self._file) as stream:
+                parser = self._parser("utf-8" if isinstance(stream, codecs.StreamRecoder) else None)
                 if fragment:
                     parser.Parse(b"<fragment>" + _DECLARATION.sub(b"", stream.read(CHUNK_BYTES)), False)
                 while block := stream.read(CHUNK_BYTES):
                     parser.Parse(block, False)
-            parser.Parse(b"</fragment>" if fragment else b"", True)
+                parser.Parse(b"</fragment>" if fragment else b"", True)
             return self._builder.close()
         except OSError as error:
             raise CaptureError(f"{self._file}: cannot be read ({error.strerror or error}).") from error
         except (expat.ExpatError, AssertionError, LookupError, ValueError) as error:
             raise CaptureError(f"{self._file}: is no whole XML file ({error}). Export or copy it again.") from None
+
+    def _parser(self, encoding: str | None) -> expat.XMLParserType:
+        """A parser of an encoding; None: of that which the file declares."""
+        parser = expat.ParserCreate(encoding)
+        parser.buffer_text = True
+        parser.StartElementHandler, parser.EndElementHandler = self._start, self._end
+        parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = self._data, self._refuse
+        return parser
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if len(self._open) >= MAX_DEPTH or (attributes and sum(map(len, attributes.values())) > MAX_TEXT):
