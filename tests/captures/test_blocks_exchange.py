@@ -135,6 +135,14 @@ def test_photographs_without_pose_are_named_and_left_out(tmp_path, flight):
     )
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "gb18030"])
+def test_exports_in_other_encodings_are_read(tmp_path, flight, encoding):
+    xml = blocks_xml(flight, "EPSG:32632").replace("utf-8", encoding).replace("UTF-8", encoding)
+    flight.touch(tmp_path)
+    (tmp_path / "block.xml").write_bytes(xml.encode(encoding))
+    assert_points(read_files(tmp_path, OPTIONS), flight)
+
+
 def test_zipped_files_and_tie_points_in_a_file_of_their_own(tmp_path, flight):
     whole = blocks_xml(flight)
     start, end = whole.index("<TiePoint>"), whole.index("</TiePoints>")

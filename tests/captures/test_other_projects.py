@@ -43,6 +43,19 @@ def test_opensfm_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> 
     assert (source.colors == flight.colors).all()
 
 
+@pytest.mark.parametrize("program", ["opensfm", "openmvg", "visualsfm", "pix4d"])
+def test_exports_in_utf_16_are_read(tmp_path: Path, flight: KnownFlight, program: str) -> None:
+    flight.write_photographs(tmp_path / "images")
+    getattr(writers, f"write_{program}")(tmp_path, flight)
+    before = read(tmp_path, program)
+    texts = [file for file in tmp_path.rglob("*") if file.suffix in (".json", ".nvm", ".txt", ".prj", ".xyz")]
+    for file in texts:
+        file.write_bytes(file.read_text().encode("utf-16"))
+    after = read(tmp_path, program)
+    for one, other in zip(before.views, after.views, strict=True):
+        assert (one.name, one.camera_from_world.tolist()) == (other.name, other.camera_from_world.tolist())
+
+
 def test_odm_project_is_read_in_metres_east_and_north(tmp_path: Path, flight: KnownFlight) -> None:
     """ODM writes UTM over reconstruction.json, and keeps what OpenSfM had made of it beside that."""
     project = tmp_path / "project"

@@ -126,6 +126,20 @@ def test_xmp_of_photographs_that_are_called_alike_in_folders(tmp_path: Path, fli
     assert np.abs(centers_of(poses) - np.concatenate([half.centers for half in halves])).max() < 1e-9
 
 
+def test_exports_in_utf_16_are_read(tmp_path: Path, flight: KnownFlight) -> None:
+    """As PowerShell and editors on Windows save them, with their mark."""
+    for name in ("table", "xmp"):
+        images = tmp_path / name / "images"
+        flight.write_photographs(images)
+        if name == "xmp":
+            writers.write_realityscan_xmp(images, flight)
+        else:
+            writers.write_realityscan_csv(tmp_path / name / "cameras.csv", flight)
+        for file in [*images.glob("*.xmp"), *(tmp_path / name).glob("*.csv")]:
+            file.write_bytes(file.read_text().encode("utf-16"))
+        check_numbers(read(tmp_path / name, "realityscan"), flight, placed=False)
+
+
 @pytest.mark.parametrize("as_attributes", [False, True])
 def test_xmp_of_realityscan_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, as_attributes: bool) -> None:
     flight.write_photographs(tmp_path / "images")

@@ -78,6 +78,40 @@ def test_brackets_of_five_of_lost_exposures_and_of_manual_cameras_are_found(firs
     assert not unused_exposures([replace(photo, datetime="") for photo in without_place])[0]
 
 
+def in_folders(photographs: list[ImageMetadata], *names: str) -> list[ImageMetadata]:
+    return [replace(p, name=f"{names[k % len(names)]}/{p.name}") for k, p in enumerate(photographs)]
+
+
+def test_brackets_sorted_into_a_folder_for_each_exposure_are_found(first):
+    names = "normal", "under", "over"
+    by_bias = in_folders(shots(first, [0, -2, 2] * 6), *names)
+    left, notes = unused_exposures(by_bias)
+    assert sorted({name.split("/")[0] for name in left}) == ["over", "under"]
+    assert len(left) == 12
+    assert "--brackets all" in notes[0]
+    two_flights = [replace(p, name=f"flight{k // 9}/{p.name}") for k, p in enumerate(by_bias)]
+    assert len(unused_exposures(two_flights)[0]) == 12
+    stops = [(-6.0, -8.0, -4.0)[k % 3] + 0.1 * (k // 3) for k in range(18)]  # the light changes
+    by_time = [replace(p, exposure_bias=0.0, exposure_stops=stops[k]) for k, p in enumerate(by_bias)]
+    assert len(unused_exposures(by_time)[0]) == 12
+    assert unused_exposures([replace(p, exposure_bias=0.0) for p in by_bias])[0] == {}
+    one_place = in_folders(shots(first, [0, -2, 2] * 6, step_m=9.0), *names)
+    assert unused_exposures(one_place)[0] == {}
+
+
+@pytest.mark.parametrize("folders", [("",), ("a", "b", "c", "d", "e")])
+def test_cameras_of_a_rig_with_automatic_exposure_are_no_brackets(first, folders):
+    """Five equal cameras without serial numbers release together; the sun lights what each sees another way."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        light = np.tile(rng.normal(0, 1.0, 5), 12) + rng.normal(0, 0.4, 60)
+        rig = in_folders(shots(first, [0.0] * 60, every_s=0, step_m=0.0, each=5), *folders)
+        by_stops = [replace(p, exposure_stops=-7 + round(3 * light[k]) / 3) for k, p in enumerate(rig)]
+        assert unused_exposures(by_stops)[0] == {}
+        by_bias = [replace(p, exposure_bias=round(3 * light[k]) / 3) for k, p in enumerate(rig)]
+        assert len(unused_exposures(by_bias)[0]) == 0
+
+
 def test_photographs_that_merely_are_dense_stay(first):
     assert unused_exposures(shots(first, [0.0] * 30, each=30))[0] == {}
     assert unused_exposures(shots(first, [0, 0, 0, -0.3, -0.3, -0.3], each=6))[0] == {}  # the pilot chose another

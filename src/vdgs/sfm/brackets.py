@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -30,15 +31,12 @@ Bracket = list[ImageMetadata]
 
 def unused_exposures(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], list[str]]:
     """The photographs of brackets that are not used, with the reason, and what people should know of them."""
-    cameras: dict[tuple[str, str, tuple[int, int]], Bracket] = {}
-    for photo in photographs:
-        cameras.setdefault((str(PurePosixPath(photo.name).parent), photo.camera, photo.size), []).append(photo)
+    cameras: dict[tuple[str, tuple[int, int]], dict[str, Bracket]] = {}
+    for photo in sorted(photographs, key=lambda photo: (photo.datetime, PurePosixPath(photo.name).name, photo.name)):
+        folders = cameras.setdefault((photo.camera, photo.size), {})
+        folders.setdefault(str(PurePosixPath(photo.name).parent), []).append(photo)
     left, used, sizes = dict[str, str](), list[str](), Counter[int]()
-    for taken in cameras.values():
-        taken.sort(key=lambda photo: (photo.datetime, photo.name))
-        brackets = _by_bias(taken)
-        by_bias = bool(brackets)
-        brackets = brackets or _by_stops(taken)
+    for brackets, by_bias in (found for folders in cameras.values() for found in _brackets(folders)):
         usual = Counter(sorted(map(_bias, each))[len(each) // 2] for each in brackets if len(each) % 2)
         for bracket in brackets:
             values = [_bias(photo) if by_bias else _stops(photo) for photo in bracket]
@@ -59,6 +57,27 @@ def unused_exposures(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, st
     ]
 
 
+def _brackets(folders: dict[str, Bracket]) -> list[tuple[list[Bracket], bool]]:
+    """Brackets of one camera, and whether by their bias: those in each folder, else those of which each exposure was
+    sorted into a folder of its own."""
+    found = [
+        (by_bias or _by_stops(taken), bool(by_bias)) for taken in folders.values() for by_bias in [_by_bias(taken)]
+    ]
+    if len(folders) < LEAST or any(brackets for brackets, _ in found):
+        return found
+    taken = sorted(chain(*folders.values()), key=lambda photo: (photo.datetime, PurePosixPath(photo.name).name))
+    biases = [[_bias(photo) for photo in each] for each in folders.values()]
+    steady = all(np.ptp(each) < SAME_STOPS for each in biases)  # false for NaN
+    if steady and (brackets := _by_bias(taken)):
+        return [(brackets, True)]
+    brackets = _by_stops(taken)
+    orders = Counter(
+        tuple(PurePosixPath(photo.name).parent.name for photo in sorted(bracket, key=_stops)) for bracket in brackets
+    )
+    is_sorted = any(count > LEAST_SHARE * len(brackets) and len({*names}) > 1 for names, count in orders.items())
+    return [(brackets, False)] if is_sorted else []
+
+
 def _bias(photo: ImageMetadata) -> float:
     return np.nan if photo.exposure_bias is None else photo.exposure_bias
 
@@ -68,18 +87,26 @@ def _stops(photo: ImageMetadata) -> float:
 
 
 def _by_bias(taken: Bracket) -> list[Bracket]:
-    """Brackets by EXIF's exposure bias, also those that lack an exposure, where one is whole."""
+    """Brackets by EXIF's exposure bias, also those that lack an exposure, where one is whole. A camera repeats its
+    brackets; cameras that release together, each with an exposure of its own, do not."""
     found = _runs(taken, [_bias(photo) for photo in taken])
-    return found if any(len(each) >= LEAST for each in found) else []
+    kinds = Counter(
+        tuple(round(value / SAME_STOPS) for value in sorted(map(_bias, each))) for each in found if len(each) >= LEAST
+    )
+    again = sum(count for count in kinds.values() if count > 1)
+    return found if kinds and (kinds.total() == 1 or again >= LEAST_SHARE * kinds.total()) else []
 
 
 def _by_stops(taken: Bracket) -> list[Bracket]:
-    """Brackets by the exposure itself, in equal steps."""
-    found = []
-    for run in _runs(taken, [_stops(photo) for photo in taken]):
+    """Brackets by the exposure itself, in equal steps, which are the same in all brackets."""
+    equal = dict[int, float]()
+    runs = _runs(taken, [_stops(photo) for photo in taken])
+    for number, run in enumerate(runs):
         steps = np.diff(sorted(_stops(photo) for photo in run))
         if len(run) >= LEAST and len(run) % 2 and steps.sum() >= LEAST_SPAN and np.ptp(steps) < SAME_STOPS:
-            found.append(run)
+            equal[number] = float(steps.mean())
+    usual = float(np.median(list(equal.values()))) if equal else 0.0
+    found = [runs[number] for number, step in equal.items() if abs(step - usual) < SAME_STOPS]
     return found if sum(map(len, found)) >= LEAST_SHARE * len(taken) else []
 
 
