@@ -353,6 +353,60 @@ def test_an_ellipsoid_without_a_datum_is_said_to_be_none(tmp_path, more, is_said
 
 
 @pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        *((words, "EPSG:32719") for words in (
+            "EPSG=32719", "EPSG-32719", "EPSG32719", "SRID=32719", "https://epsg.io/32719", "projection: EPSG:32719",
+            "EPSG: 32719 - WGS 84 / UTM zone 19S", "WGS 84 / UTM zone 19S (EPSG::32719)", "UTM19S", "UTM 19 S",
+            "http://www.opengis.net/gml/srs/epsg.xml#32719", "WGS_1984_UTM_Zone_19S", "EPSG:32719,EPSG:5773",
+        )),
+        ("SIRGAS2000 UTM 19S", "EPSG:31979"), ("SWEREF99 TM", "EPSG:3006"), ("LV95", "EPSG:2056"),
+        ("ETRS89 UTM 33N", "EPSG:25833"), ("British National Grid", "EPSG:27700"), ("PRETTY", "EPSG:25833"),
+        ("NAD83(2011) / California zone 3 (ftUS)", "EPSG:6420"),
+    ],
+)  # fmt: skip
+def test_words_for_systems_that_programs_and_people_write(tmp_path, words, code):
+    pyproj = pytest.importorskip("pyproj")
+    crs = pyproj.CRS(code)
+    near = {"EPSG:32719": (-33.5, -70.6), "EPSG:31979": (-33.5, -70.6), "EPSG:3006": (59, 15), "EPSG:2056": (47, 8)}
+    latitude, longitude = near.get(code, {"EPSG:27700": (52, -1), "EPSG:6420": (37.5, -121)}.get(code, (48.1, 15.2)))
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
+    words = crs.to_wkt(pretty=True) if words == "PRETTY" else words
+    (tmp_path / "geo.txt").write_text(f"{words}\na.jpg {x} {y} 500\nb.jpg {x + 30} {y} 500\n")
+    (first, _) = read_gps_table(tmp_path / "geo.txt").rows
+    assert first.position[:2] == pytest.approx((latitude, longitude), abs=1e-7)
+
+
+@pytest.mark.parametrize("words", ["RD New", "NAD83(2011) (ftUS)", "UTM 33", "WGS84 UTM Zone 33", "Lambert 93"])
+def test_words_that_name_no_one_system_ask_for_a_code(tmp_path, words):
+    (tmp_path / "geo.txt").write_text(f"{words}\na.jpg 500000 5300000 500\nb.jpg 500030 5300000 500\n")
+    with pytest.raises(CaptureError, match="EPSG:32"):
+        read_gps_table(tmp_path / "geo.txt")
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        "H_ell,H_msl,sdh,sdv", "gps_altitude_hae,,hrms[m],vrms[m]", "Altitude,,std_h (m),std_v (m)",
+        "Altitude,Latitude_acc_(m),Longitude_acc_(m),Altitude_acc_(m)",
+    ],
+)  # fmt: skip
+def test_more_names_of_altitudes_and_accuracies(tmp_path, columns):
+    middle = "0.02" if "acc" in columns else "455"
+    (tmp_path / "t.csv").write_text(f"name,lat,lon,{columns}\na.jpg,48.1,15.2,500,{middle},0.02,0.04\n")
+    (row,) = read_gps_table(tmp_path / "t.csv").rows
+    assert row.position == (48.1, 15.2, 500)
+    assert row.gps_std == (0.02, 0.04)
+
+
+def test_rows_without_names_of_columns_have_accuracies_behind_three_angles(tmp_path):
+    (tmp_path / "t.csv").write_text(
+        "a.jpg,48.1,15.2,500,1.2,0.3,45,0.02,0.04\nb.jpg,48.2,15.2,500,1,0.3,45,0.02,0.04\n"
+    )
+    assert read_gps_table(tmp_path / "t.csv").rows[0].gps_std == (0.02, 0.04)
+
+
+@pytest.mark.parametrize(
     ("system", "x", "y", "error_m", "said"),
     [
         ("EPSG:31467", 3500000, 5400000, 3, "converted from DHDN to WGS 84, good to 3 m"),

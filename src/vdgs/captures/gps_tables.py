@@ -21,6 +21,7 @@ from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
     datum_error,
     in_units_of,
+    join_definition,
     look_like_degrees,
     names_a_system,
     to_geodetic,
@@ -109,7 +110,8 @@ def read_gps_table(file: Path) -> GpsTable:
         if re.search(begins, head, re.MULTILINE):
             raise CaptureError(f"{file}: {what}")
     system, body = None, list[Line]()
-    for line in lines:
+    definition, count = join_definition([_after_colon(line.text) for line in lines])
+    for line in [Line(lines[0].number, definition), *lines[count:]] if count > 1 else lines:
         if system is None and not body and names_a_system(_after_colon(line.text)):
             system = _after_colon(line.text)
         else:
@@ -143,7 +145,7 @@ def read_gps_table(file: Path) -> GpsTable:
     datum_error_m, converted = 0.0, ""
     if columns.system is not None:
         datum_error_m, converted = datum_error(columns.system, np.array(positions))
-    notes += [f"{file.name}: positions are {converted}; maps in its own system are not."] if converted else []
+    notes += [f"{file.name}: positions are {converted} (maps in that system lose nothing)."] if converted else []
     if len(placed) < len(rows):
         notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
     return GpsTable(tuple(found), notes=tuple(notes), datum_error_m=datum_error_m)
@@ -153,7 +155,7 @@ def _after_colon(text: str) -> str:
     """A line without the sign of a comment and without `CoordinateSystem:` (Metashape) before the system."""
     plain = text.lstrip("# ").strip()
     head, colon, rest = plain.partition(":")
-    return rest.strip() if colon and re.fullmatch(r"(?i)coordinate ?system|crs|srs", head.strip()) else plain
+    return rest.strip() if colon and re.fullmatch(r"(?i)coordinate ?system|crs|srs|projection", head.strip()) else plain
 
 
 def _is_header(line: Line) -> bool:
@@ -197,13 +199,15 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
     if not _has_numbers(rows[0]):
         found = ", ".join(sorted(word for word in rows[0].words if word)) or "nothing"
         marks = "" if system is None else " A list of control points is given as --gcp."
+        if system is None and not known and len(rows) > 1 and _has_numbers(rows[1]):
+            marks = " If it is to name a coordinate system, write its code, such as EPSG:32633."
         raise CaptureError(
             f"{file}: needs a first line that names the columns name,lat,lon,alt (found: {found}).{marks}"
         )
     order = {"name": 0, "alt": 3} if len(rows[0].words) > 3 else {"name": 0}
+    if len(rows[0].words) > 8:  # ODM, Pix4D: name x y z, three angles and two accuracies
+        order |= {"across": 7, "upwards": 8}
     if system is not None:
-        if len(rows[0].words) > 8:  # ODM: name x y z yaw pitch roll and two accuracies
-            order |= {"across": 7, "upwards": 8}
         return _Columns({**order, "x": 1, "y": 2}, system), rows
     values = [number_of(row.words[k]) for row in rows for k in (1, 2) if len(row.words) > k]
     firsts, seconds = np.abs(np.array(values[::2], float)), np.abs(np.array(values[1::2], float))

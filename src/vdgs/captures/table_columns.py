@@ -21,7 +21,8 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "longitud longitudine 经度",
         "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
         "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
-        "heightellipsoid ellh elevationm altft altitudeft altitudefeet heightft hohe altitud altura quota 高度 海拔",
+        "heightellipsoid ellh hell hmsl hae "
+        "elevationm altft altitudeft altitudefeet heightft hohe altitud altura quota 高度 海拔",
         "x": "x pointx "
         "easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
         "y": "y pointy northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
@@ -30,15 +31,17 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "lonref": "lonref longituderef gpslongituderef",
         "altref": "altref altituderef gpsaltituderef",
         "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror accuracyxy errorxy "
-        "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy",
+        "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy sdh stdh hrms hstd",
         "eastwards": "rmsx stdx sdx sigmax xrms "
-        "rmseasting eastingrms sde stddeve sigmae accuracyxeasting accuracyxlongitude accuracyx",
+        "longitudeacc lonacc xacc eastingacc rmseasting eastingrms sde stddeve sigmae accuracyxeasting "
+        "accuracyxlongitude accuracyx",
         "northwards": "rmsy stdy sdy sigmay yrms "
-        "rmsnorthing northingrms sdn stddevn sigman accuracyynorthing accuracyylatitude accuracyy",
+        "latitudeacc latacc yacc northingacc rmsnorthing northingrms sdn stddevn sigman accuracyynorthing "
+        "accuracyylatitude accuracyy",
         "upwards": "accuracyvertical verticalaccuracy vacc accuracyv vdev verticalerror accuracyz errorz "
-        "verticalaccuracym zaccuracy "
+        "verticalaccuracym zaccuracy sdv stdv vrms vstd altitudeacc altacc zacc heightacc "
         "rmsz stdz sdz sigmaz zrms rmselevation elevationrms sdu stddevu sigmau accuracyzaltitude",
-        "system": "epsg crs srs epsgcode",
+        "system": "epsg crs srs epsgcode csname coordinatesystem",
     }.items()
 }  # fmt: skip
 _UNIT = re.compile(
@@ -54,7 +57,7 @@ _ALTITUDE = re.compile(r"alt(?!ura)|elli?p|ellh|elev|海拔", re.IGNORECASE)
 _ALTITUDES = re.compile(
     r"(?!sensorheight)(?:gps|gnss|abs|absolute|ell|ellips|ellipsoid(?:al)?|ortho|orthometric|msl|amsl|wgs84|camera|geoid|sensor)*"
     r"(?:altitude|alt|height|hgt|hght|elevation|elev)"
-    r"(?:gps|abs|ell|ellips|ellipsoid(?:al)?|ortho|msl|amsl|wgs84|m)*|pointz"
+    r"(?:gps|abs|ell|ellips|ellipsoid(?:al)?|ortho|msl|amsl|hae|wgs84|m)*|pointz"
 )
 #: Numbers with signs between thousands and another one before the decimals: 6,292,126.02 and 6.292.126,02.
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:,\d{3})+\.\d+|(?:\.\d{3})+,\d+)")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, datum_error, in_units_of, to_geodetic
+from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, datum_error, in_units_of, join_definition, to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.captures.table_columns import NO_DATA, UNKNOWN, known_columns, meters_of, number_of
@@ -211,7 +211,8 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float, ...]]:
     lines = [Line(*line) for line in text_lines(file, "control points")]
     if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
-    header, *lines = lines
+    text, count = join_definition([line.text for line in lines])
+    header, lines = Line(lines[0].number, text), lines[count:]
     rows = [Row(line.number, line.text.split()) for line in lines]
     if separator_of([line.text for line in lines]):
         rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
