@@ -117,7 +117,19 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
     assert len(load_capture(Path(link[3])).views) == 12
 
 
-@pytest.mark.parametrize("name", ["a/sfm_data.bin", "database.db", "poses_bounds.npy", "place.psx", "place.rcproj"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a/sfm_data.bin",
+        "database.db",
+        "poses_bounds.npy",
+        "place.psx",
+        "place.rcproj",
+        "scene.mvs",
+        "sensors/trajectories.txt",
+        "keyframes/corrected_cameras/1.json",
+    ],
+)
 def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     large = tiny_scene(width=160, height=120)
     write_images(tmp_path, large)
@@ -139,6 +151,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
             "of Metashape without poses",
         ),
         ("block.xml", '<?xml version="1.0"?><BlocksExchange version="3.2"><Block/></BlocksExchange>', "without poses"),
+        ("metadata.json", '{"w": 720, "h": 960, "initPose": [0, 0, 0, 1, 0, 0, 0]}', "poses of Record3D"),
         ("cameras.json", '[{"id": 0, "img_name": "a", "position": [0, 0, 1], "fx": 900}]', "of a trained 3DGS scene"),
         ("meta_data.json", '{"camera_model": "OPENCV", "has_mono_prior": true, "frames": []}', "poses of SDFStudio"),
         ("sfm_data.json", '{"sfm_data_version": "0.3", "views": [], "extrinsics": []}', "OpenMVG without poses"),

@@ -48,7 +48,9 @@ _OTHERS = {
     "*.mg": "a project of Meshroom; cameras.sfm of its step StructureFromMotion is read",
     "sfm.abc": "poses of Meshroom in Alembic; cameras.sfm beside it, or the .sfm of its step ConvertSfMFormat, is read",
     "Ori-*/Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
-    "keyframes/cameras/*.json": (
+    "sensors/trajectories.txt": "poses of Kapture; kapture_export_colmap.py makes a COLMAP model of them, which is read",
+    "*.mvs": "a scene of OpenMVS; the COLMAP or OpenMVG model that it was made of is read",
+    "keyframes/*cameras/*.json": (
         "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
     ),
     "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
@@ -62,6 +64,10 @@ _BY_CONTENT = (
     (".xml", b"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
     (".xml", b"<document version", f"an export of Metashape without poses; {_ALIGN}"),
     (".json", b'"has_mono_prior"', "poses of SDFStudio; the transforms.json or COLMAP model of the same data is read"),
+    (
+        ".json", b'"initpose"',
+        "poses of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of them, which is read",
+    ),
     (".json", b'"img_name"', "cameras of a trained 3DGS scene; the capture that it was trained on is read"),
     (".json", b'"sfm_data_version"', "photographs of OpenMVG without poses; the sfm_data.json after its SfM is read"),
     (".sfm", b'"viewid"', "photographs of Meshroom without poses; cameras.sfm of its step StructureFromMotion is read"),
