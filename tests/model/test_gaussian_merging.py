@@ -9,7 +9,7 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.model.gaussian_merging import gaussian_weights, group_neighbors, merge_by_moments
 from vdgs.model.gaussian_transform import gaussian_covariances, quaternion_from_matrix, transform_gaussians
-from vdgs.model.gaussians import Gaussians
+from vdgs.model.gaussians import Gaussians, MergedGaussians
 
 
 def total(gaussians: Gaussians, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -78,6 +78,17 @@ def test_what_closed_a_surface_closes_it_merged():
     assert 1.2 < float(times.min()) <= float(times.max()) <= 2.0 + 1e-6
     enough = merge_by_moments(square, groups, enlarge=100.0)
     np.testing.assert_allclose(gaussian_weights(enough).sum(), gaussian_weights(square).sum(), rtol=1e-3)
+
+
+def test_merged_gaussians_cover_what_their_members_cover_through_all_levels():
+    """Also where that is more than an opaque Gaussian covers: what one lacks, the next level still knows."""
+    some = random_gaussians(400, 1)
+    level = MergedGaussians(**some.tensors(), covers=torch.ones(400))
+    for count in (100, 20, 1):
+        level = merge_by_moments(level, np.arange(len(level)) % count, enlarge=1.0)
+        assert len(level.covers) == count
+        np.testing.assert_allclose(gaussian_weights(level).sum(), gaussian_weights(some).sum(), rtol=1e-3)
+    assert level.covers[0] > 1
 
 
 def test_flat_gaussians_stay_flat_and_what_has_no_extent_stays_finite():

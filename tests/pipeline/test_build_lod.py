@@ -22,10 +22,11 @@ from vdgs.export.lod_bake import CameraTable, merge_cells
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decoder import Decoder
-from vdgs.model.gaussian_merging import gaussian_weights
+from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
+from vdgs.model.gaussians import MergedGaussians
 from vdgs.model.lod_nodes import TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
-from vdgs.model.lod_scene import LodScene
+from vdgs.model.lod_scene import LodScene, merged_splats
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
@@ -184,6 +185,35 @@ def test_merging_cells_keeps_what_it_merges(scene):
     torch.testing.assert_close(
         one.means[0].double(), (weights * gaussians.means).sum(0) / weights.sum(), atol=1e-5, rtol=0
     )
+
+
+def test_cells_merge_what_lies_nearest_to_their_means():
+    """Seen on a line: a Gaussian beside the border of a cell joins those of the next cell that are nearer."""
+    x = torch.tensor([0.0, 0.1, 0.95, 1.05, 1.1, 1.15])
+    place = torch.stack([x, x * 0, x * 0], 1)
+    some = MergedGaussians(
+        means=place, log_scales=torch.full((6, 3), -3.0), quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1),
+        opacity_logits=torch.zeros(6), sh0=torch.zeros(6, 3), shN=torch.zeros(6, 3, 3), covers=torch.ones(6),
+    )  # fmt: skip
+    merged, _ = merge_cells(some, 1.0, np.zeros(6))
+    torch.testing.assert_close(merged.means[:, 0], torch.tensor([0.05, 1.0625]), atol=1e-5, rtol=0)
+
+
+def test_from_afar_one_gaussian_dims_as_much_as_the_many_that_it_stands_for_and_near_by_no_more_than_an_opaque_one():
+    """A stack of Gaussians smaller than a pixel, each drawn as transparent as its blur makes it."""
+    places = np.random.default_rng(5).uniform(-0.02, 0.02, (100, 3)).astype(np.float32)
+    many = MergedGaussians(
+        means=torch.from_numpy(places), log_scales=torch.full((100, 3), -4.0), opacity_logits=torch.zeros(100),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(100, 1), sh0=torch.zeros(100, 3), shN=torch.zeros(100, 3, 3),
+        covers=torch.ones(100),
+    )  # fmt: skip
+    one = merge_by_moments(many, np.zeros(100, np.int64), enlarge=1.0)
+    assert one.covers[0] > 10
+    far, near = (merged_splats(one, camera_at(0.0, 0.0, height)).opacities for height in (30.0, 0.1))
+    # The share of its area that a splat has without blur is right to 3e-4.
+    through = (1 - merged_splats(many, camera_at(0.0, 0.0, 30.0)).opacities).prod()
+    torch.testing.assert_close(far[0], 1 - through, rtol=0.05, atol=0)
+    assert 0.99 < float(near[0]) <= 0.999 + 1e-6
 
 
 def test_memory_is_bounded_by_what_was_asked_for(scene):

@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from vdgs.captures.camera_height import pixel_at_camera_height
 from vdgs.export.bake import BakeViews, fit_gaussians, gaussian_count, view_contributions
@@ -21,13 +22,11 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
-from vdgs.model.gaussians import Gaussians
+from vdgs.model.gaussians import Gaussians, MergedGaussians
 from vdgs.model.lod_nodes import NodeRecord
 
 #: Cells along the side of a node.
 CELLS_PER_EDGE = 64
-#: Merged Gaussians are enlarged so much at most where they cover less than their members: 2 blurs, 1 leaves holes.
-MAX_ENLARGED = 1.2
 #: Training cameras that a leaf is baked from, and of how many of the nearest they are chosen.
 CAMERAS_PER_LEAF, MAX_CANDIDATES = 8, 64
 #: They draw a leaf at most so wide and high (pixels): eight for each cell.
@@ -40,18 +39,18 @@ SH_DEGREE = 1
 MIN_LEAF_ERROR = 0.1
 
 
-def bake_leaf(model: AnchorModel, cameras: CameraTable) -> tuple[Gaussians, Float[np.ndarray, " m"]]:
-    """The Gaussians that the best training cameras see of a few anchors, and how many pixels each makes."""
+def bake_leaf(model: AnchorModel, cameras: CameraTable) -> Gaussians:
+    """The Gaussians that the best training cameras see of a few anchors."""
     positions = model.anchors.positions.numpy()
     windows = [window for camera in cameras.choose(positions) if (window := _turned(camera, positions)) is not None]
     shown = [view_contributions(model, window) for window in windows]
-    pixels = np.zeros(gaussian_count(model), np.float32)
+    seen = np.zeros(gaussian_count(model), bool)
     for view in shown:
-        pixels[view.gaussians.numpy()] += view.pixels.numpy()
-    wanted = np.flatnonzero(pixels)
+        seen[view.gaussians.numpy()] = True
+    wanted = np.flatnonzero(seen)
     if not len(wanted):
-        return empty_gaussians(SH_DEGREE), pixels[:0]
-    return fit_gaussians(BakeViews(model, windows, shown), wanted, SH_DEGREE), pixels[wanted]
+        return empty_gaussians(SH_DEGREE)
+    return fit_gaussians(BakeViews(model, windows, shown), wanted, SH_DEGREE)
 
 
 def with_learnt_blur(gaussians: Gaussians, pixel: float) -> Gaussians:
@@ -71,10 +70,11 @@ def empty_gaussians(degree: int) -> Gaussians:
 
 
 def merge_cells(
-    gaussians: Gaussians, cell: float, errors: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"] | None = None
-) -> tuple[Gaussians, float]:
-    """One Gaussian for all that share a cell, apart from those larger than it, and how far they then are from their
-    true places: the root mean square by weight, on top of the `errors` that they had."""
+    gaussians: MergedGaussians, cell: float, errors: Float[np.ndarray, " n"]
+) -> tuple[MergedGaussians, float]:
+    """As many Gaussians as cells of space hold some, each for those that are nearest to what one cell holds, apart from
+    those larger than a cell; and how far they then are from their true places: the root mean square by weight, on top
+    of the `errors` that they had."""
     if not len(gaussians):
         return gaussians, 0.0
     means = gaussians.means.double().numpy()
@@ -82,12 +82,30 @@ def merge_cells(
     large = gaussians.log_scales.amax(1).numpy() > np.log(cell)
     sizes = index.max(0) + 1
     keys = ((index[:, 0] * sizes[1] + index[:, 1]) * sizes[2] + index[:, 2]) * 2 + large
-    groups = np.unique(keys, return_inverse=True)[1]
-    merged = merge_by_moments(gaussians, groups, weights, MAX_ENLARGED)
-    weights = gaussian_weights(gaussians) if weights is None else weights
+    weights = gaussian_weights(gaussians)
+    groups = _nearest_means(means, np.unique(keys, return_inverse=True)[1], large, weights)
+    # Larger ones would blur: what they cover less than their members they keep as `covers`.
+    merged = merge_by_moments(gaussians, groups, weights, enlarge=1.0)
     apart = means - merged.means.double().numpy()[groups]
     square = np.average(errors**2 + (apart * apart).sum(1), weights=weights)
     return merged, float(np.sqrt(square))
+
+
+def _nearest_means(
+    means: Float[np.ndarray, "n 3"], groups: Int[np.ndarray, " n"], large: Bool[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
+) -> Int[np.ndarray, " n"]:  # fmt: skip
+    """The group whose mean is nearest to each, of those of its kind (a step of k-means): borders of cells cut through
+    what belongs together."""
+    found = np.empty_like(groups)
+    for kind in (False, True):
+        rows = np.flatnonzero(large == kind)
+        if len(rows):
+            numbers = np.unique(groups[rows], return_inverse=True)[1]
+            sums = np.stack([np.bincount(numbers, weights[rows] * axis) for axis in means[rows].T], 1)
+            tree = cKDTree(sums / np.bincount(numbers, weights[rows])[:, None])
+            found[rows] = 2 * tree.query(means[rows])[1] + kind
+    return np.unique(found, return_inverse=True)[1]
 
 
 def node_record(
@@ -170,20 +188,21 @@ class CameraTable:
         return [self._cameras[near[i]] for i in sorted(chosen)]
 
 
-def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[Gaussians, float]:
+def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[MergedGaussians, float]:
     """What a leaf draws instead of its anchors, and how far off it is."""
-    baked, pixels = bake_leaf(model, cameras)
-    baked = with_learnt_blur(baked, max(cameras.pixel, model.photograph_pixel))
+    baked = with_learnt_blur(bake_leaf(model, cameras), max(cameras.pixel, model.photograph_pixel))
     cell = edge / CELLS_PER_EDGE
-    merged, error = merge_cells(baked, cell, np.zeros(len(baked)), pixels.astype(np.float64))
+    merged, error = merge_cells(
+        MergedGaussians(**baked.tensors(), covers=torch.ones(len(baked))), cell, np.zeros(len(baked))
+    )
     return merged, max(error, MIN_LEAF_ERROR * cell)
 
 
 def parent_gaussians(
-    children: Sequence[Gaussians], records: Sequence[NodeRecord], edge: float
-) -> tuple[Gaussians, float]:
+    children: Sequence[MergedGaussians], records: Sequence[NodeRecord], edge: float
+) -> tuple[MergedGaussians, float]:
     """What a node draws instead of its children, and how far off it is."""
-    together = Gaussians(
+    together = MergedGaussians(
         **{name: torch.cat([child.tensors()[name] for child in children]) for name in children[0].tensors()}
     )
     errors = np.repeat([record.error for record in records], [len(child) for child in children])

@@ -10,6 +10,8 @@ neighbors of its own color on its own surface, goes first; a roof's edge and a r
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -18,10 +20,12 @@ from torch import Tensor
 
 from vdgs.kernels.spherical_harmonics import SH_C0
 from vdgs.model.gaussian_transform import gaussian_covariances
-from vdgs.model.gaussians import Gaussians
+from vdgs.model.gaussians import AnyGaussians, Gaussians, MergedGaussians
 
 #: Opacities of merged Gaussians end here, as those that are drawn do.
 MAX_OPACITY = 0.999
+#: No more surfaces than so many are counted behind each other (`MergedGaussians`).
+MAX_COVERS = 1e4
 #: Merged Gaussians are enlarged so much at most where they would cover less than their members.
 MAX_ENLARGED = 2.0
 #: Of so many nearest neighbors each Gaussian may join one in a pass.
@@ -37,14 +41,15 @@ CHUNK = 1 << 17
 
 
 def merge_by_moments(
-    gaussians: Gaussians, groups: Int[np.ndarray, " n"], weights: Float[np.ndarray, " n"] | None = None,
+    gaussians: AnyGaussians, groups: Int[np.ndarray, " n"], weights: Float[np.ndarray, " n"] | None = None,
     enlarge: float = MAX_ENLARGED,
-) -> Gaussians:  # fmt: skip
+) -> AnyGaussians:  # fmt: skip
     """One Gaussian for each group, in the order of their numbers, 0 .. the number of groups - 1, none empty.
 
     Weight, mean and covariance of a group are conserved, coefficients of color are its weighted means. So is what it
     covers, opacity times area: where an opaque Gaussian of this covariance covers less, as on a closed surface, it is
-    larger, up to `enlarge` times. What is alone in its group stays as it is.
+    larger, up to `enlarge` times, and `MergedGaussians` keep what is still missing. What is alone in its group stays as
+    it is.
     """
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
@@ -62,7 +67,7 @@ def merge_by_moments(
     apart = gaussians.means.double() - means[torch.from_numpy(groups)]
     spread = pooled(gaussian_covariances(gaussians).double() + apart[:, :, None] * apart[:, None, :])
     log_scales, quaternions = ellipsoid_axes(spread)
-    cover = gaussians.opacity_logits.double().sigmoid() * _areas(gaussians)
+    cover = torch.from_numpy(gaussian_weights(gaussians))
     together = Gaussians(
         means=means, log_scales=log_scales, quaternions=quaternions, opacity_logits=means[:, 0],
         sh0=pooled(gaussians.sh0), shN=pooled(gaussians.shN),
@@ -73,8 +78,10 @@ def merge_by_moments(
         "opacity_logits": torch.logit((opacity / larger).clamp(1e-6, MAX_OPACITY)),
         "log_scales": log_scales + larger.log()[:, None] / 2,
     }
+    if isinstance(gaussians, MergedGaussians):
+        merged["covers"] = (opacity / larger / MAX_OPACITY).clamp(1, MAX_COVERS)
     first, alone = gaussians.select(torch.from_numpy(order[starts])), torch.from_numpy(sizes == 1)
-    return Gaussians(**{
+    return replace(gaussians, **{
         name: torch.where(alone.reshape(-1, *[1] * (value.dim() - 1)), first.tensors()[name], value.float())
         for name, value in merged.items()
     })  # fmt: skip
@@ -92,8 +99,11 @@ def merge_to(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 
 
 def gaussian_weights(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
-    """Opacity times area of each; never 0."""
-    return np.maximum((gaussians.opacity_logits.double().sigmoid() * _areas(gaussians)).numpy(), 1e-30)
+    """Opacity times area of each, or what its members cover; never 0."""
+    opacities = gaussians.opacity_logits.double().sigmoid()
+    if isinstance(gaussians, MergedGaussians):
+        opacities = opacities * gaussians.covers
+    return np.maximum((opacities * _areas(gaussians)).numpy(), 1e-30)
 
 
 def _areas(gaussians: Gaussians) -> Float[Tensor, " n"]:

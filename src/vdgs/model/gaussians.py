@@ -9,7 +9,8 @@ equations 5 and 6 are in `kernels.project`, 2 and 3 in `kernels.rasterize`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +22,9 @@ from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.spherical_harmonics import eval_sh_colors
 from vdgs.model.scale_bounds import MAX_SIGMA
+
+#: Gaussians, merged ones or not.
+AnyGaussians = TypeVar("AnyGaussians", bound="Gaussians")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,22 +48,30 @@ class Gaussians:
     def tensors(self) -> dict[str, Tensor]:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
-    def select(self, rows: Tensor) -> Gaussians:
+    def select(self: AnyGaussians, rows: Tensor) -> AnyGaussians:
         """The Gaussians of the given rows (indices or mask)."""
-        return Gaussians(**{name: tensor[rows] for name, tensor in self.tensors().items()})
+        return replace(self, **{name: tensor[rows] for name, tensor in self.tensors().items()})
 
-    def to(self, device: torch.device | str) -> Gaussians:
+    def to(self: AnyGaussians, device: torch.device | str) -> AnyGaussians:
         """The same Gaussians on a device; the same tensors where they are on it."""
-        return Gaussians(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
+        return replace(self, **{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
-    def concat(self, more: Gaussians) -> Gaussians:
+    def concat(self: AnyGaussians, more: AnyGaussians) -> AnyGaussians:
         """These Gaussians followed by others."""
-        return Gaussians(**{name: torch.cat([t, more.tensors()[name]]) for name, t in self.tensors().items()})
+        return replace(self, **{name: torch.cat([t, more.tensors()[name]]) for name, t in self.tensors().items()})
 
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics that there is room for."""
         return math.isqrt(self.shN.shape[1] + 1) - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergedGaussians(Gaussians):
+    """Gaussians that may stand for more than they can cover themselves, as where surfaces lie behind each other."""
+
+    #: What the members cover, in parts of what the Gaussian covers where it is opaque; 1 where it is less.
+    covers: Float[Tensor, " n"]
 
 
 @torch.no_grad()

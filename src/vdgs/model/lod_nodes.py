@@ -19,12 +19,12 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.model.anchors import Anchors
-from vdgs.model.gaussians import Gaussians
+from vdgs.model.gaussians import MergedGaussians
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import read_tensors, read_tensors_unchecked, tensors_crc32, write_tensors
 
 TREE_FILE = "tree.safetensors"
-LOD_FORMAT, NODE_FORMAT = "vdgs-lod-2", "vdgs-lod-node-1"
+LOD_FORMAT, NODE_FORMAT = "vdgs-lod-3", "vdgs-lod-node-2"
 #: What to do about a tree that cannot be used.
 REBUILD_HINT = "Delete that folder and make the tree again: vdgs lod RUN"
 
@@ -97,16 +97,16 @@ def anchors_file(folder: Path, node: int) -> Path:
     return folder / "anchors" / f"{node:06d}.safetensors"
 
 
-def save_node(path: Path, gaussians: Gaussians, record: NodeRecord) -> None:
+def save_node(path: Path, gaussians: MergedGaussians, record: NodeRecord) -> None:
     """Write the merged Gaussians of a node: places in full, all else in half precision."""
     tensors = {name: t.half() if name != "means" else t for name, t in gaussians.tensors().items()}
     content = {**vars(record), "crc32": tensors_crc32(tensors)}
     write_atomic(path, lambda file: write_tensors(file, tensors, {NODE_FORMAT: json.dumps(content)}))
 
 
-def load_node(path: Path) -> Gaussians:
+def load_node(path: Path) -> MergedGaussians:
     """The merged Gaussians of a node, in float32. Raises VdgsError for a damaged file."""
-    return Gaussians(**{name: tensor.float() for name, tensor in _read(path, Gaussians).items()})
+    return MergedGaussians(**{name: tensor.float() for name, tensor in _read(path, MergedGaussians).items()})
 
 
 def save_anchors(path: Path, anchors: Anchors, rows: Int[np.ndarray, " r"]) -> None:
@@ -142,7 +142,7 @@ def _header(path: Path) -> dict[str, Any]:
         return content
 
 
-def _read(path: Path, kind: type[Gaussians] | type[Anchors]) -> dict[str, Tensor]:
+def _read(path: Path, kind: type[MergedGaussians] | type[Anchors]) -> dict[str, Tensor]:
     try:
         tensors = read_tensors_unchecked(path)
         if _header(path)["crc32"] != tensors_crc32(tensors):

@@ -15,7 +15,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
-from vdgs.model.gaussians import Gaussians, project_splats
+from vdgs.model.gaussians import MergedGaussians, project_splats
 from vdgs.model.lod_tree import LodCut, LodTree
 from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
 
@@ -44,7 +44,7 @@ class LodScene:
     #: beside a small part of a view.
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
-    _gaussians: dict[tuple[int, ...], Gaussians | None] = field(default_factory=dict)
+    _gaussians: dict[tuple[int, ...], MergedGaussians | None] = field(default_factory=dict)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -102,10 +102,8 @@ class LodScene:
             first = len(anchors.anchors)
         gaussians = _held(self._gaussians, cut.nodes, self._assemble_gaussians)
         if gaussians is not None:
-            # The blur that the model has learnt is part of them (`export.lod_bake`).
-            splats = compensated_splats(project_splats(gaussians, camera, gaussians.sh_degree), camera, 0.0)
             sources.append(torch.arange(first, first + len(gaussians), device=self.device))
-            shown.append(splats)
+            shown.append(merged_splats(gaussians, camera))
         if not shown:
             empty = torch.zeros(0, device=self.device)
             wide = empty.new_zeros(0, 3)
@@ -175,7 +173,7 @@ class LodScene:
             anchors = replace(anchors, opacity_factors=factors.to(anchors.positions))
         return (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
 
-    def _assemble_gaussians(self, nodes: tuple[int, ...]) -> Gaussians | None:
+    def _assemble_gaussians(self, nodes: tuple[int, ...]) -> MergedGaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
         found = self.tree.gaussians_of(nodes)
         if found is not None and self.fade is not None:
@@ -185,9 +183,7 @@ class LodScene:
             opacities = found.opacity_logits.sigmoid() * factors[drawn].to(found.opacity_logits)
             whole = factors[drawn] == 1
             found = replace(found, opacity_logits=torch.where(whole, found.opacity_logits, opacities.logit()))
-        if found is None:
-            return None
-        return Gaussians(**{name: tensor.to(self.device) for name, tensor in found.tensors().items()})
+        return None if found is None else found.to(self.device)
 
 
 _Held = TypeVar("_Held")
@@ -203,6 +199,16 @@ def _held(
         held.pop(next(iter(held)), None)
     held[nodes] = content
     return content
+
+
+def merged_splats(gaussians: MergedGaussians, camera: Camera) -> Splats:
+    """The splats of merged Gaussians in a view, without aliasing: the blur that the model has learnt is part of them
+    (`export.lod_bake`). One that covers several times as much as itself is drawn as so many behind each other, each as
+    transparent as the blur makes it."""
+    splats = project_splats(gaussians, camera, gaussians.sh_degree)
+    shares = compensated_splats(replace(splats, opacities=torch.ones_like(splats.opacities)), camera, 0.0).opacities
+    # 1 - (1 - share) ** covers
+    return replace(splats, opacities=splats.opacities * -torch.expm1(gaussians.covers * torch.log1p(-shares)))
 
 
 def model_of_rows(model: AnchorModel, anchors: Anchors, rows: Int[Tensor, " r"]) -> AnchorModel:

@@ -100,8 +100,8 @@ def build_lod(context: RunContext, request: LodRequest, console: Console) -> Pat
 def _key(model_id: str) -> str:
     """What the nodes depend on."""
     settings = [
-        MAX_LEAF_ANCHORS, lod_bake.CELLS_PER_EDGE, lod_bake.MAX_ENLARGED, lod_bake.CAMERAS_PER_LEAF,
-        lod_bake.MAX_CANDIDATES, lod_bake.SAMPLES, lod_bake.SH_DEGREE, lod_bake.MAX_WINDOW_PX, lod_bake.MIN_LEAF_ERROR,
+        MAX_LEAF_ANCHORS, lod_bake.CELLS_PER_EDGE, lod_bake.CAMERAS_PER_LEAF, lod_bake.MAX_CANDIDATES,
+        lod_bake.SAMPLES, lod_bake.SH_DEGREE, lod_bake.MAX_WINDOW_PX, lod_bake.MIN_LEAF_ERROR,
     ]  # fmt: skip
     return hashlib.sha256(json.dumps([LOD_FORMAT, model_id, settings]).encode()).hexdigest()[:16]
 
