@@ -1,6 +1,7 @@
 """Readings of what the paper leaves open, one changed at a time from the preset `paper`, on validation views.
 
-    python -m experiments.reports.analyses.paper_readings DATA WORK [--scenes seneca copr] [--only NAME ...] [--counts]
+    python -m experiments.reports.analyses.paper_readings DATA WORK [--scenes seneca copr] [--only NAME ...] [--seed N]
+        [--counts]
 
 Of each scene one short coarse model is trained. Each reading cuts a copy of it, trains its blocks, merges and measures
 them; test photographs are left out. Rows are appended to WORK/rows.jsonl and kept: the same command continues, and
@@ -68,12 +69,24 @@ COARSE_READINGS: dict[str, tuple[str, ...]] = {
     "coarse: the preset `paper`": (),
     "coarse: distance as an input of the decoder": ("--model.view-distance",),
     "coarse: rates of offsets times the cameras' radius": ("--lr-offsets-unit", "cameras"),
-    "coarse: mean color behind the scene": ("--loss.background", "mean"),
+    "coarse: black behind the scene": ("--loss.background", "black", "--loss.random-background", "0"),
+    "coarse: mean color behind the scene": ("--loss.background", "mean", "--loss.random-background", "0"),
     "coarse: random color behind the scene": ("--loss.background", "mean", "--loss.random-background", "1"),
     "coarse: Gaussians bounded": ("--model.bound-scales",),
     "coarse: outliers kept": ("--init.outlier-distance", "0"),
     "coarse: gaps filled": ("--init.fill-gaps",),
     "coarse: sparse Adam": ("--optimizer", "sparse-adam"),
+    "coarse: blur of a photograph's pixel": ("--model.photograph-blur",),
+    "coarse: compensation": ("--compensation.enabled",),
+}
+#: Readings of both stages: options of `vdgs train-coarse`, and what follows the coarse model.
+TO_THE_END: dict[str, tuple[tuple[str, ...], Changes]] = {
+    f"to the end: {color}": (COARSE_READINGS[f"coarse: {color}"], {"block.random_background": share})
+    for color, share in (
+        ("black behind the scene", 0.0),
+        ("mean color behind the scene", 0.0),
+        ("random color behind the scene", 1.0),
+    )
 }
 READINGS: dict[str, Changes] = {
     "the preset `paper`": {},
@@ -89,8 +102,13 @@ READINGS: dict[str, Changes] = {
     "g to sums, one gate": {"block.compensation.target": "sum", "block.compensation.min_draws": "paper"},
     "T_low = 0.05": {"block.compensation.t_low": 0.05},
     "T_low = 0.3": {"block.compensation.t_low": 0.3},
+    "β_g = 0.1": {"block.compensation.beta_g": 0.1},
+    "γ = 0.5": {"block.compensation.gamma": 0.5},
+    "rates of blocks times 0.4 and 0.8": {"block.lr_scale_offsets": 0.4, "block.lr_scale_log_scales": 0.8},
+    "random color behind blocks": {"block.random_background": 1.0},
     "expansion 0": {"partition.expansion": 0.0},
     "every photograph joins its best block": {"assignment.always_best": True},
+    "at least 30 cameras a block": {"assignment.min_cameras": 30},
     "cameras by `coverage`": {"assignment.mode": "coverage"},
     **CUTS,
 }
@@ -117,9 +135,10 @@ def call(*arguments: object) -> None:
             raise
 
 
-def coarse_run(data: Path, folder: Path, scene: str, options: tuple[str, ...] = ()) -> RunFolder:
+def coarse_run(data: Path, folder: Path, scene: str, seed: int, options: tuple[str, ...] = ()) -> RunFolder:
     """A run of the scene's coarse model, trained once."""
-    call("train-coarse", data / scene, *SCENES[scene][0], *COARSE, *options, "--output", folder, "--quiet")
+    options = (*SCENES[scene][0], *COARSE, "--seed", str(seed), *options)
+    call("train-coarse", data / scene, *options, "--output", folder, "--quiet")
     call("visibility", folder, "--quiet")
     run = RunFolder(folder)
     if not (run.coarse.path / "evaluation").exists():
@@ -189,36 +208,41 @@ def metrics(evaluation: Path) -> dict[str, Any]:
     return {name: found[name] for name in names} | {"quarters": quarters}
 
 
-def rows(data: Path, work: Path, scenes: list[str], only: list[str], train: bool) -> Iterator[dict[str, Any]]:
-    """Every reading of every scene that is not done yet."""
+def rows(
+    data: Path, work: Path, scenes: list[str], only: list[str], train: bool, seed: int
+) -> Iterator[dict[str, Any]]:
+    """Every reading of every scene that is not done yet with this seed."""
     file = work / "rows.jsonl"
     done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     yield from done
-    names = {(each["scene"], each["reading"], each["trained"]) for each in done}
+    names = {(each["scene"], each["reading"], each["trained"]) for each in done if each.get("seed", 0) == seed}
+    readings = [
+        *((name, arguments, None) for name, arguments in COARSE_READINGS.items() if name in only),
+        *((name, *reading) for name, reading in TO_THE_END.items() if name in only),
+        *((name, (), changes) for name, changes in READINGS.items() if not only or name in only),
+    ]
     for scene in scenes:
-        for reading, arguments in COARSE_READINGS.items() if train else ():
-            if (scene, reading, train) not in names and reading in only:
-                run = coarse_run(data, work / f"coarse-{os.getpid()}", scene, arguments)
-                row = {
-                    "scene": scene,
-                    "reading": reading,
-                    "trained": True,
-                    "now": metrics(run.coarse.path / "evaluation"),
-                }
-                shutil.rmtree(run.path)
-                yield write_row(file, row)
-        coarse = coarse_run(data, work / f"{scene}-coarse", scene)
-        for reading, changes in READINGS.items():
-            if (scene, reading, train) in names or (only and reading not in only):
+        for reading, arguments, changes in readings:
+            if (scene, reading, train) in names or not (train or is_of_cut(arguments, changes)):
                 continue
-            if changes and changed(coarse.method(), changes) == coarse.method():
-                continue  # what the preset has
-            if not train and any(name.startswith(("block", "merge")) for name in changes):
-                continue  # cuts and cameras are the same
-            run = copy_with(coarse, work / f"reading-{os.getpid()}", {"partition.blocks": SCENES[scene][1]} | changes)
-            row = {"scene": scene, "reading": reading, "trained": train, "changes": changes} | counts(run)
-            row |= measured(run, coarse) if train else {}
-            yield write_row(file, row)
+            folder = work / (f"coarse-{os.getpid()}" if arguments else f"{scene}-coarse-{seed}")
+            coarse = coarse_run(data, folder, scene, seed, arguments)
+            row: dict[str, Any] = {"scene": scene, "reading": reading, "trained": train, "seed": seed}
+            if changes is None:
+                yield write_row(file, row | {"now": metrics(coarse.coarse.path / "evaluation")})
+            elif arguments or not changes or changed(coarse.method(), changes) != coarse.method():  # else the preset
+                run = copy_with(
+                    coarse, work / f"reading-{os.getpid()}", {"partition.blocks": SCENES[scene][1]} | changes
+                )
+                row |= {"changes": changes} | counts(run)
+                yield write_row(file, row | (measured(run, coarse) if train else {}))
+            if arguments:
+                shutil.rmtree(folder)
+
+
+def is_of_cut(arguments: tuple[str, ...], changes: Changes | None) -> bool:
+    """Whether a reading may change cuts and cameras of the preset's coarse model."""
+    return not arguments and changes is not None and not any(name.startswith(("block", "merge")) for name in changes)
 
 
 def write_row(file: Path, row: dict[str, Any]) -> dict[str, Any]:
@@ -230,15 +254,16 @@ def write_row(file: Path, row: dict[str, Any]) -> dict[str, Any]:
 
 #: Heading of a column, and its cell of a row.
 COUNT_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "reading": lambda row: row["reading"],
+    "reading": lambda row: row["reading"] + (f", seed {row['seed']}" if row.get("seed") else ""),
     "cameras of each block": lambda row: ", ".join(map(str, row["cameras"])),
     "photographs that train no core": lambda row: f"{row['idle']} of {row['photographs']}",
     "anchors owned by their cluster's block": lambda row: f"{row['own_cluster']:.1%}",
     "standard deviation of V in blocks, in all": lambda row: f"{row['std_v']:.2f}, {row['std_v_all']:.2f}",
 }
 RESULT_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "reading": lambda row: row["reading"],
+    "reading": lambda row: row["reading"] + (f", seed {row['seed']}" if row.get("seed") else ""),
     "PSNR": lambda row: f"{row['now']['psnr']:.2f}",
+    "corrected": lambda row: f"{row['now']['psnr_cc']:.2f}",
     "SSIM": lambda row: f"{row['now']['ssim']:.3f}",
     "PSNR where 3 cameras look": lambda row: f"{row['now']['psnr_covered_own_background']:.2f}",
     "least seen, best seen quarter": lambda row: f"{row['now']['quarters'][0]:.2f}, {row['now']['quarters'][-1]:.2f}",
@@ -250,7 +275,7 @@ RESULT_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
 def as_markdown(found: list[dict[str, Any]]) -> str:
     """The rows as tables: cuts and cameras, coarse models, merged scenes."""
     lines = ["# Readings of what the paper leaves open", "", *TABLE_HEAD]
-    order = [*COARSE_READINGS, *READINGS]
+    order = [*COARSE_READINGS, *TO_THE_END, *READINGS]
     found = sorted(found, key=lambda each: order.index(each["reading"]))
     for scene in sorted({each["scene"] for each in found}):
         of_scene = [each for each in found if each["scene"] == scene]
@@ -279,6 +304,7 @@ if __name__ == "__main__":
     parser.add_argument("work", type=Path)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     parser.add_argument("--only", nargs="+", default=[])
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--counts", action="store_true", help="cuts and cameras alone, without training blocks")
     parser.add_argument("--table", type=Path, help="only write the rows that are done as Markdown")
     options = parser.parse_args()
@@ -288,5 +314,5 @@ if __name__ == "__main__":
         raise SystemExit
     options.work.mkdir(parents=True, exist_ok=True)
     print(describe())
-    for each in rows(options.data, options.work, options.scenes, options.only, not options.counts):
+    for each in rows(options.data, options.work, options.scenes, options.only, not options.counts, options.seed):
         print(json.dumps(each)[:300])
