@@ -44,7 +44,7 @@ PRESETS: dict[str, MethodConfig] = {
             loss=LossConfig(random_background=0.0),
         ),
         partition=PartitionConfig(cluster_axes="ground", cluster_clip=0.0, cluster_smoothing=0.5, min_block_share=0.0),
-        assignment=AssignmentConfig(mode="paper", tau=0.05, always_best=False, min_cameras=0),
+        assignment=AssignmentConfig(mode="paper", always_best=False, min_cameras=0),
         block=BlockConfig(random_background=0.0, margin="ramp", mask_moving="off"),
         merge=MergeConfig(rule="max-visibility"),
     ),
