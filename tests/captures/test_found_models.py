@@ -133,7 +133,7 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
 def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
     large = tiny_scene(width=160, height=120)
     write_images(tmp_path, large)
-    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text("[]")
     assert not any("Poses are made anew" in note for note in collect_images([tmp_path]).notes)
     (tmp_path / name).write_text('[{"shots": {"a": {"rotation": [0, 0, 0]}}}]')

@@ -48,7 +48,7 @@ _OTHERS = {
     "*.mg": "a project of Meshroom; cameras.sfm of its step StructureFromMotion is read",
     "sfm.abc": "poses of Meshroom in Alembic; cameras.sfm beside it, or the .sfm of its step ConvertSfMFormat, is read",
     "Ori-*/Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
-    "sensors/trajectories.txt": "poses of Kapture; kapture_export_colmap.py makes a COLMAP model of them, which is read",
+    "sensors/trajectories.txt": "poses of Kapture; kapture_export_colmap.py makes a COLMAP model, which is read",
     "*.mvs": "a scene of OpenMVS; the COLMAP or OpenMVG model that it was made of is read",
     "keyframes/*cameras/*.json": (
         "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
