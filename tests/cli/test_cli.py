@@ -24,8 +24,8 @@ from vdgs.cli.main import COMMANDS, HELP, get_command, main, verb_arguments
 from vdgs.cli.run_cmd import NOT_KEPT, RunArguments
 from vdgs.config.options import Option, options_of
 
-#: Modules of those that take long to import, for each process in the order in which they are, and what each imports only
-#: when needed.
+#: Modules of those that take long to import, in the order in which they are, and what each imports only when needed: of
+#: each of two processes.
 IMPORTED_LATE = (
     {"vdgs.report.write_report": "torch"},
     {"vdgs.viewer.server": "matplotlib", "vdgs.export.export_run": "viser"},
