@@ -189,8 +189,8 @@ def test_default_and_paper_restart_the_coarse_stage_and_paper_leaves_our_choices
         "partition.cluster_axes", "partition.cluster_clip", "partition.cluster_smoothing", "partition.min_block_share",
         "assignment.always_best", "assignment.min_cameras", "assignment.mode", "block.random_background",
         "block.margin", "block.mask_moving", "merge.rule", "training.optimizer", "training.model.bound_scales",
-        "training.model.photograph_blur", "training.init.fill_gaps", "training.loss.random_background",
-        "training.model.background_model",
+        "training.model.photograph_blur", "training.init.fill_gaps", "training.loss.background",
+        "training.loss.random_background", "training.model.background_model",
     }  # fmt: skip
     assert not validate_config(paper)
 

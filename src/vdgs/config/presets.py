@@ -41,7 +41,7 @@ PRESETS: dict[str, MethodConfig] = {
             optimizer="adam",
             model=ModelConfig(bound_scales=False, photograph_blur=False, background_model="off"),
             init=InitConfig(fill_gaps=False),
-            loss=LossConfig(random_background=0.0),
+            loss=LossConfig(background="black", random_background=0.0),
         ),
         partition=PartitionConfig(cluster_axes="ground", cluster_clip=0.0, cluster_smoothing=0.5, min_block_share=0.0),
         assignment=AssignmentConfig(mode="paper", always_best=False, min_cameras=0),
