@@ -50,7 +50,7 @@ class TrainCoarseArguments(ConfigFileArguments, ComputeOptions, QuietArguments):
     """Settings by name. `auto`: those of the run that is there, else `laptop`. `laptop`: a good result in minutes on a
     CPU. `default`: the paper's 100 000 iterations, and our choices where it is silent: gaps filled, outliers left out,
     a background of the mean color, of random colors in training, bounded sizes, only visible anchors moved. `paper`:
-    the paper as printed and, where it is silent, what serves it best on validation views (docs/paper.md)."""
+    the paper as printed; docs/paper.md lists what it takes where the paper is silent."""
     options: Annotated[CaptureOptions, FlagName("")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, FlagName("")] = field(default_factory=TrainConfig)
     checkpointing: Annotated[CheckpointOptions, FlagName("")] = field(default_factory=CheckpointOptions)

@@ -78,8 +78,7 @@ class RunRequest(ComputeOptions):
     and our choices where it is silent: gaps filled, outliers left out, a background of the mean color, of random
     colors in training, bounded sizes, cameras by `coverage` and each in its best block, a minimum of cameras a
     block, blocks drawn in their surroundings, a lower gate of compensated growth, g added to means, only visible
-    anchors moved. `paper`: the paper as printed and, where it is silent, the readings that serve it best on
-    validation views (docs/paper.md)."""
+    anchors moved. `paper`: the paper as printed; docs/paper.md lists what it takes where the paper is silent."""
     overwrite: bool = False
     """Let other settings discard what was trained with the old ones."""
     jobs: Annotated[int, WORKER_COUNT] = 0

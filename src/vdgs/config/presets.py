@@ -1,10 +1,10 @@
 """Settings by name.
 
 `paper`     the paper as printed, but for the input of the decoder; where it is silent, the reading that served it best
-            on validation views or, where none was measured, that of Scaffold-GS. docs/paper.md lists every choice, with
+            on validation views or, where none clearly did, that of Scaffold-GS. docs/paper.md lists every choice, with
             its alternatives.
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
-            smoothed cores; gaps filled; random colors behind the scene, bounded Gaussians, sparse Adam; cameras by `coverage`,
+            smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam; cameras by `coverage`,
             each with a block and each block with a hundred; and a frozen margin.
 `laptop`    a good result in minutes on a CPU: what a few thousand steps ask for, and plain growth in blocks, for
             compensated growth (`--block.compensation.enabled`) lost where few cameras look; docs/paper.md says what
