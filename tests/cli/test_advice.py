@@ -16,6 +16,7 @@ from vdgs.cli.main import COMMANDS, verb_arguments
 SOURCE = Path(vdgs.__file__).parent
 #: Options of other programs, by the end of the file that names them.
 OF_OTHERS = {
+    "broken_packages.py": {"--force-reinstall"},
     "system_checks.py": {"--force-reinstall"},
     "executor_options.py": {"--gres", "--qos", "--constraint"},
     "slurm_commands.py": {
