@@ -33,6 +33,7 @@ from vdgs.viewer.layers import DisplayOptions, Painter
 from vdgs.viewer.live_run import open_run_or_checkpoint
 from vdgs.viewer.render_scheduler import RenderedFrame, RenderScheduler
 from vdgs.viewer.viewer_scene import PART_CACHE_BYTES, REST_ERROR_PX, REST_MAX_COST, ViewerScene
+from vdgs.visibility.visibility_counts import FADE_BELOW
 
 #: A visitor moves so often a second.
 MOVES_PER_SECOND = 60
@@ -47,7 +48,8 @@ INTERRUPT_SECONDS = (0.6, 1.1, 1.6, 2.1)
 class Visitor:
     """Takes the pictures of a scheduler, with their times."""
 
-    def __init__(self, scene: ViewerScene) -> None:
+    def __init__(self, scene: ViewerScene, display: DisplayOptions) -> None:
+        self._display = display
         #: With the time of the clock and of the processors.
         self.scheduler, self.frames = RenderScheduler(), list[tuple[float, float, RenderedFrame]]()
         self._came = threading.Condition()
@@ -63,7 +65,7 @@ class Visitor:
         raise error
 
     def ask(self, camera: Camera) -> None:
-        self.scheduler.request_frame(self.session, camera, DisplayOptions())
+        self.scheduler.request_frame(self.session, camera, self._display)
 
     def wait(self, full: bool) -> tuple[float, RenderedFrame]:
         """The next picture; a full one, if so asked."""
@@ -102,6 +104,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=4.0)
     parser.add_argument("--samples", type=int, default=4, help="of a pixel each way, of the picture compared with")
     parser.add_argument("--flight", type=int, default=0, help="steps of a flight from over all into the street")
+    parser.add_argument(
+        "--min-visibility", type=int, default=FADE_BELOW, help="cameras below which the scene fades out"
+    )
     parser.add_argument("--motion-only", action="store_true", help="compare with no full detail, which takes minutes")
     options = parser.parse_args()
     configure_threads(0)
@@ -109,7 +114,7 @@ def main() -> None:
     tree = scene.tree(scene.names[0])
     assert tree is not None, "the run has no level-of-detail tree: vdgs lod RUN"
     places = standpoints(tree, options.width, options.height)
-    visitor = Visitor(scene)
+    visitor = Visitor(scene, DisplayOptions(min_visibility=options.min_visibility))
     visitor.ask(places["overview"])
     when, _ = visitor.wait(full=False)
     begun = time.time() - psutil.Process().create_time() - (time.monotonic() - when)

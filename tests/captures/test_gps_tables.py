@@ -463,3 +463,34 @@ def test_moments_of_a_drone_are_matched_by_number(tmp_path):
     assert found.image_indices.tolist() == [0, 1, 2, 3]
     assert np.all(np.diff(found.enu[:, 1]) < -100)
     assert found.gps_std[0] == pytest.approx([0.02, 0.02, 0.03])
+
+
+def test_a_table_of_several_systems_is_refused_and_blank_cells_are_none(tmp_path):
+    rows = ["a.jpg,500000,5700000,100,{}", "b.jpg,500100,5700000,101,EPSG:32633", "c.jpg,500100,5700100,101,EPSG:32633"]
+    text = "\n".join(["Name,Easting,Northing,Elevation,CS name", *rows])
+    (tmp_path / "t.csv").write_text(text.format(""))
+    assert read_gps_table(tmp_path / "t.csv").rows[0].position[1] == pytest.approx(15.0, abs=0.01)
+    (tmp_path / "t.csv").write_text(text.format("EPSG:32632"))
+    with pytest.raises(CaptureError, match="several coordinate systems"):
+        read_gps_table(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("name", ["site1_UTM33_0001.JPG", "UTM_0001.JPG", "SRID0001.JPG", "EPSG12_1.jpg"])
+def test_names_of_photographs_are_no_systems(tmp_path, name):
+    (tmp_path / "t.csv").write_text(f"{name},48.1,15.2,500\nb.jpg,48.2,15.2,500\n")
+    assert read_gps_table(tmp_path / "t.csv").rows[0].name == name
+
+
+def test_a_column_of_zones_is_no_system(tmp_path):
+    (tmp_path / "t.csv").write_text("UTM_Zone,name,lat,lon,alt\n33,a.jpg,48.1,15.2,500\n33,b.jpg,48.2,15.2,500\n")
+    assert read_gps_table(tmp_path / "t.csv").rows[0].position[:2] == pytest.approx((48.1, 15.2))
+
+
+def test_a_datum_over_degrees_counts(tmp_path):
+    rows = "name,{}\na.jpg,{},500\nb.jpg,{},500\n"
+    (tmp_path / "t.csv").write_text("EPSG:4230\n" + rows.format("lat,lon,alt", "48.1,15.2", "48.2,15.2"))
+    (tmp_path / "x.csv").write_text("EPSG:4230\n" + rows.format("x,y,z", "15.2,48.1", "15.2,48.2"))
+    degrees, plane = read_gps_table(tmp_path / "t.csv"), read_gps_table(tmp_path / "x.csv")
+    assert degrees.rows[0].position[:2] == pytest.approx(plane.rows[0].position[:2], abs=1e-9)
+    assert abs(degrees.rows[0].position[0] - 48.1) > 1e-4
+    assert degrees.datum_error_m == plane.datum_error_m > 0

@@ -123,6 +123,15 @@ def test_local_coordinates_in_feet_are_metres_by_what_references_show(tmp_path, 
     assert ("nothing in the file shows" in said) == (poses_in_feet is None)
 
 
+@pytest.mark.parametrize("unit", [FEET, FEET.replace("0.304800609601219", "-")])
+def test_references_of_another_size_show_nothing_of_a_unit(tmp_path, unit):
+    flight = true_flight()
+    xml = metashape_xml(flight, reference=unit, transform=metashape_transform(LOCAL))
+    source = read(tmp_path, xml, flight)  # its references are degrees
+    assert_true(source, flight)
+    assert not any("references of its cameras show" in each for each in source.warnings)
+
+
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "gb18030", "shift_jis", "cp1252"])
 def test_exports_in_other_encodings(tmp_path, encoding):
     flight = true_flight(count=6)

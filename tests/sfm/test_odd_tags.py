@@ -112,6 +112,21 @@ def test_cameras_of_a_rig_with_automatic_exposure_are_no_brackets(first, folders
         assert len(unused_exposures(by_bias)[0]) == 0
 
 
+def test_heads_of_a_rig_that_call_their_photographs_the_same_are_no_brackets(first):
+    heads = in_folders(shots(first, [-0.3, 0.0, 0.3] * 6, every_s=0, step_m=0.0), "left", "nadir", "right")
+    assert len(unused_exposures(heads)[0]) == 12  # of one camera, that numbers what it takes
+    rig = [replace(p, name=f"{p.name.split('/')[0]}/{k // 3}.jpg") for k, p in enumerate(heads)]
+    assert unused_exposures(rig)[0] == {}
+    manual = [replace(p, exposure_bias=0.0, exposure_stops=(9.0, 10.0, 11.0)[k % 3]) for k, p in enumerate(rig)]
+    assert unused_exposures(manual)[0] == {}
+
+
+def test_brackets_about_another_exposure_each_are_found(first):
+    steps = np.array([0.0, -0.7, 0.7])
+    biases = [float(each) for compensation in (0, 0.3, 0.7, 1.0, -0.3, -0.7) for each in steps + compensation]
+    assert len(unused_exposures(shots(first, biases))[0]) == 12
+
+
 def test_photographs_that_merely_are_dense_stay(first):
     assert unused_exposures(shots(first, [0.0] * 30, each=30))[0] == {}
     assert unused_exposures(shots(first, [0, 0, 0, -0.3, -0.3, -0.3], each=6))[0] == {}  # the pilot chose another

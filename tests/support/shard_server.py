@@ -63,7 +63,11 @@ def fork_shard_where_asked() -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
         server.connect(os.environ[VARIABLE])
         order = {"arguments": sys.orig_argv[3:], "folder": os.getcwd(), "environment": dict(os.environ)}
-        socket.send_fds(server, [json.dumps(order | {"started": os.getpid()}).encode()], [1, 2])
+        socket.send_fds(
+            server,
+            [json.dumps(order | {"started": os.getpid()}, ensure_ascii=False).encode(errors="surrogateescape")],
+            [1, 2],
+        )
         shard = int(server.recv(MOST_BYTES))
         if not shard:
             return
@@ -83,14 +87,17 @@ def fork_shard_where_asked() -> None:
 
 
 def _serve(listener: socket.socket) -> None:
-    """Fork shards and tell how they end. No threads: it forks."""
+    """Fork shards and tell how they end, until the tests end, however these do. No threads: it forks."""
     import multiprocessing
     from multiprocessing.connection import wait
 
+    tests: Any = multiprocessing.parent_process()
     running = dict[int, tuple[Any, socket.socket]]()
+    if tests.sentinel in wait([listener, tests.sentinel]):
+        return
     _decline_first(listener)
-    while True:
-        for ready in wait([listener, *running]):
+    while tests.sentinel not in (found := wait([listener, tests.sentinel, *running])):
+        for ready in found:
             if isinstance(ready, int):
                 shard, asking = running.pop(ready)
                 shard.join()
@@ -101,6 +108,7 @@ def _serve(listener: socket.socket) -> None:
             shard = multiprocessing.get_context("fork").Process(target=_become, args=(asking,))
             shard.start()
             running[shard.sentinel] = shard, asking
+    os._exit(0)  # its shards end with it
 
 
 def _decline_first(listener: socket.socket) -> None:
@@ -120,7 +128,7 @@ def _become(asking: socket.socket) -> None:
 
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # it ends with the server
     message, outputs, _, _ = socket.recv_fds(asking, MOST_BYTES, 2)
-    order = json.loads(message)
+    order = json.loads(message.decode(errors="surrogateescape"))
     os.setsid()
     for descriptor, output in zip((1, 2), outputs, strict=True):
         os.dup2(output, descriptor)

@@ -17,8 +17,8 @@ from vdgs.geometry.geodesy import FLATTENING, SEMI_MAJOR_M, geodetic_from_ecef
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 _STARTS = re.compile(
-    r"(\d{4,6}$|(EPSG|ESRI|SRID)[\s:=_-]*\d+|urn:ogc:def:crs:|https?://(www\.opengis\.net/(def/crs|gml/srs)|epsg\.io)/"
-    r"|WGS\s?84\b|(\w+ ?\d+[ /_]*)?UTM[\s_]?(\d|zone)"
+    r"(\d{4,6}$|(EPSG|ESRI|SRID)[\s:=_-]*\d+(?!\w|\.\w)|urn:ogc:def:crs:|https?://(www\.opengis\.net/(def/crs|gml/srs)|epsg\.io)/"
+    r"|WGS\s?84\b|(\w+ ?\d+[ /_]*)?UTM[\s_]*(zone[\s_:]*)?\d{1,2}[\s_]*(north|south|[A-Z])?(?!\w|\.\w)"
     r"|\w[\w() +-]* / \w|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
 )  # fmt: skip
 #: Codes in whatever stands around them: `EPSG:32633+5773`, `EPSG=32633`, `UTM zone 33N (EPSG::32633)`, addresses.

@@ -21,6 +21,7 @@ from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
     datum_error,
     in_units_of,
+    is_in_degrees,
     join_definition,
     look_like_degrees,
     names_a_system,
@@ -129,6 +130,9 @@ def read_gps_table(file: Path) -> GpsTable:
         raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
     place = _projected if columns.system is not None and "x" in columns.where else _geodetic
     positions = place(placed, columns, file)
+    if place is _geodetic and columns.system is not None:
+        changed = to_geodetic(columns.system, file)[0](np.array(positions)[:, [1, 0, 2]])
+        positions = [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)]
     found = [
         GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
         for row, position in zip(placed, positions, strict=True)
@@ -177,13 +181,20 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
             math.degrees(1) if RADIANS.search(rows[0].words[known[what]]) else 1.0 for what in ("lat", "lon")
         )
         angles = latitude, longitude
-        return _Columns(known, None, unit, heights=heights, deviation_units=units, across_units=angles), rows[1:]
+        datum = system if system is not None and _is_datum(system, file) else None
+        return _Columns(known, datum, unit, heights=heights, deviation_units=units, across_units=angles), rows[1:]
     if {"lat", "lon"} <= set(known):
         raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
     if {"name", "x", "y"} <= set(known):
         if system is None and "system" in known and len(rows) > 1:
-            code = rows[1].words[known["system"]]
-            system = f"EPSG:{code}" if code.isdecimal() else code
+            k = known["system"]
+            codes = sorted({row.words[k].strip() for row in rows[1:] if k < len(row.words)} - {""})
+            if len(codes) > 1:
+                raise CaptureError(
+                    f"{file}: names several coordinate systems ({', '.join(codes[:3])}). Make a table of each, or give "
+                    "name,lat,lon,alt."
+                )
+            system = f"EPSG:{codes[0]}" if codes and codes[0].isdecimal() else next(iter(codes), None)
         if system is None and _are_degrees(rows[1:], known):
             note = "does not say what x and y are; they look like longitude and latitude, and are taken as that."
             places = {**known, "lon": known["x"], "lat": known["y"]}
@@ -218,8 +229,21 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         )
     swapped = firsts.max(initial=0) > 90
     places = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
-    note = "" if swapped else "names no columns; read as name, latitude, longitude, altitude."
+    read = f"name, {'longitude, latitude' if swapped else 'latitude, longitude'}, altitude"
+    more = ", ..., accuracies across and up" if "across" in order else ""
+    note = "" if swapped and not more else f"names no columns; read as {read}{more}."
     return _Columns({**order, **places}, None, note=note), rows
+
+
+def _is_datum(system: str, file: Path) -> bool:
+    """Whether a line above latitudes and longitudes names a system of degrees other than WGS 84."""
+    if re.fullmatch(r"(?i)(EPSG:)?(4326|4979)|WGS[ _]?84", system):
+        return False
+    try:
+        to_geodetic(system, file)
+    except CaptureError:  # not understood, or pyproj is not there: as before
+        return False
+    return is_in_degrees(system)
 
 
 def _are_degrees(rows: Sequence[Row], known: Mapping[str, int]) -> bool:

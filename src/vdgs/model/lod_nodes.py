@@ -62,6 +62,8 @@ class LodTable:
         if not path.exists():
             raise VdgsError(f"{path.parent}: holds no finished level-of-detail tree. Make it: vdgs lod RUN")
         tensors, header = read_tensors(path)
+        if LOD_FORMAT not in header and any(key.startswith("vdgs-lod-") for key in header):
+            raise VdgsError(f"{path.parent}: is of another version of vdgs. Make it again: vdgs lod RUN")
         try:
             content = json.loads(header[LOD_FORMAT])
             if content["crc32"] != tensors_crc32(tensors):

@@ -69,13 +69,18 @@ def _brackets(folders: dict[str, Bracket]) -> list[tuple[list[Bracket], bool]]:
     biases = [[_bias(photo) for photo in each] for each in folders.values()]
     steady = all(np.ptp(each) < SAME_STOPS for each in biases)  # false for NaN
     if steady and (brackets := _by_bias(taken)):
-        return [(brackets, True)]
+        return [(brackets, True)] if _are_numbered(brackets) else []
     brackets = _by_stops(taken)
     orders = Counter(
         tuple(PurePosixPath(photo.name).parent.name for photo in sorted(bracket, key=_stops)) for bracket in brackets
     )
     is_sorted = any(count > LEAST_SHARE * len(brackets) and len({*names}) > 1 for names, count in orders.items())
-    return [(brackets, False)] if is_sorted else []
+    return [(brackets, False)] if is_sorted and _are_numbered(brackets) else []
+
+
+def _are_numbered(brackets: list[Bracket]) -> bool:
+    """Whether names differ, as of one camera: those of a rig each count their own, and call theirs the same."""
+    return all(len({PurePosixPath(photo.name).name for photo in each}) == len(each) for each in brackets)
 
 
 def _bias(photo: ImageMetadata) -> float:
@@ -91,10 +96,9 @@ def _by_bias(taken: Bracket) -> list[Bracket]:
     brackets; cameras that release together, each with an exposure of its own, do not."""
     found = _runs(taken, [_bias(photo) for photo in taken])
     kinds = Counter(
-        tuple(round(value / SAME_STOPS) for value in sorted(map(_bias, each))) for each in found if len(each) >= LEAST
+        tuple(np.round(np.diff(sorted(map(_bias, each))), 1).tolist()) for each in found if len(each) >= LEAST
     )
-    again = sum(count for count in kinds.values() if count > 1)
-    return found if kinds and (kinds.total() == 1 or again >= LEAST_SHARE * kinds.total()) else []
+    return found if kinds and (kinds.total() < LEAST or max(kinds.values()) >= LEAST_SHARE * kinds.total()) else []
 
 
 def _by_stops(taken: Bracket) -> list[Bracket]:

@@ -10,6 +10,8 @@ from traceback import walk_tb
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml"}
 #: What torch says where it was built for another numpy; packages that were built so say it in a ValueError.
 _OTHER_NUMPY = re.compile(r"numpy is not available", re.IGNORECASE)
+#: What is said where memory ends while a library is loaded, and of a backend that the environment names.
+_OF_THE_MACHINE = re.compile(r"cannot allocate memory|is not a valid value for backend", re.IGNORECASE)
 #: Where numpy hides what went wrong in a page of advice.
 _ORIGINAL = re.compile(r"original error was: *(.+)", re.IGNORECASE)
 
@@ -21,6 +23,8 @@ def broken_packages(error: BaseException) -> tuple[str, ...]:
         return "torch", "numpy"
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None):
         return ()  # the machine's fault; ctypes finds libraries missing without a number
+    if _OF_THE_MACHINE.search(str(error)):
+        return ()
     found: list[str] = []
     for frame, _ in walk_tb(error.__traceback__):
         package = str(frame.f_globals.get("__name__", "")).partition(".")[0]

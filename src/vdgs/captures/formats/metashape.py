@@ -44,7 +44,9 @@ _UNUSED = ("frames", "markers", "shapes", "region", "depth_maps_sets")
 #: A chunk without a coordinate system whose origin is so far from that of its transform is on the globe (metres).
 _ON_GLOBE_M = (SEMI_MAJOR_M - 60_000, SEMI_MAJOR_M + 60_000)
 #: The unit of a local coordinate system and the metres in one.
-_UNIT = re.compile(r"\bUNIT\[\s*\"([^\"]+)\"\s*,\s*([\d.eE+-]+)")
+_UNIT = re.compile(r"\bUNIT\[\s*\"([^\"]+)\"\s*,\s*(\d*\.?\d+(?:[eE][+-]?\d+)?)\s*[,\]]")
+#: Cameras and their references spread alike up to so much (logarithm of the ratio; choice).
+SAME_SIZE = 0.2
 _FALSE = ("0", "false")
 
 
@@ -340,8 +342,9 @@ class _Chunk:
                 references.append(xml_numbers(" ".join(words), 3, self._file, f"the reference of {label}"))
         spread = [float(np.sqrt(np.var(each, axis=0).sum())) if len(each) > 2 else 0.0 for each in (places, references)]
         ratio = spread[1] / spread[0] if min(spread) > 0 else 0.0
-        counts_in_unit = bool(ratio and abs(np.log(ratio)) < abs(np.log(ratio * meters)))
-        why = "as the references of its cameras show" if ratio else "which nothing in the file shows"
+        counts_in_unit = bool(ratio) and abs(np.log(ratio)) < SAME_SIZE
+        shown = counts_in_unit or (bool(ratio) and abs(np.log(ratio * meters)) < SAME_SIZE)
+        why = "as the references of its cameras show" if shown else "which nothing in the file shows"
         taken = unit[1] if counts_in_unit else "metres"
         self._warnings.append(f"its local coordinates are in {unit[1]}; its poses are taken as {taken}, {why}.")
         return meters if counts_in_unit else 1.0
