@@ -9,7 +9,7 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.model.gaussian_merging import gaussian_weights, group_neighbors, merge_by_moments
 from vdgs.model.gaussian_transform import gaussian_covariances, quaternion_from_matrix, transform_gaussians
-from vdgs.model.gaussians import Gaussians, MergedGaussians
+from vdgs.model.gaussians import Gaussians, NodeGaussians
 
 
 def total(gaussians: Gaussians, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -83,7 +83,7 @@ def test_what_closed_a_surface_closes_it_merged():
 def test_merged_gaussians_cover_what_their_members_cover_through_all_levels():
     """Also where that is more than an opaque Gaussian covers: what one lacks, the next level still knows."""
     some = random_gaussians(400, 1)
-    level = MergedGaussians(**some.tensors(), covers=torch.ones(400))
+    level = NodeGaussians(**some.tensors(), covers=torch.ones(400))
     for count in (100, 20, 1):
         level = merge_by_moments(level, np.arange(len(level)) % count, enlarge=1.0)
         assert len(level.covers) == count

@@ -23,7 +23,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decoder import Decoder
 from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
-from vdgs.model.gaussians import MergedGaussians
+from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_nodes import TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
 from vdgs.model.lod_scene import LodScene, merged_splats
@@ -191,7 +191,7 @@ def test_cells_merge_what_lies_nearest_to_their_means():
     """Seen on a line: a Gaussian beside the border of a cell joins those of the next cell that are nearer."""
     x = torch.tensor([0.0, 0.1, 0.95, 1.05, 1.1, 1.15])
     place = torch.stack([x, x * 0, x * 0], 1)
-    some = MergedGaussians(
+    some = NodeGaussians(
         means=place, log_scales=torch.full((6, 3), -3.0), quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1),
         opacity_logits=torch.zeros(6), sh0=torch.zeros(6, 3), shN=torch.zeros(6, 3, 3), covers=torch.ones(6),
     )  # fmt: skip
@@ -202,7 +202,7 @@ def test_cells_merge_what_lies_nearest_to_their_means():
 def test_from_afar_one_gaussian_dims_as_much_as_the_many_that_it_stands_for_and_near_by_no_more_than_an_opaque_one():
     """A stack of Gaussians smaller than a pixel, each drawn as transparent as its blur makes it."""
     places = np.random.default_rng(5).uniform(-0.02, 0.02, (100, 3)).astype(np.float32)
-    many = MergedGaussians(
+    many = NodeGaussians(
         means=torch.from_numpy(places), log_scales=torch.full((100, 3), -4.0), opacity_logits=torch.zeros(100),
         quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(100, 1), sh0=torch.zeros(100, 3), shN=torch.zeros(100, 3, 3),
         covers=torch.ones(100),

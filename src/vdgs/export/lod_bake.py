@@ -22,7 +22,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
-from vdgs.model.gaussians import Gaussians, MergedGaussians
+from vdgs.model.gaussians import Gaussians, NodeGaussians
 from vdgs.model.lod_nodes import NodeRecord
 
 #: Cells along the side of a node.
@@ -69,9 +69,7 @@ def empty_gaussians(degree: int) -> Gaussians:
     )  # fmt: skip
 
 
-def merge_cells(
-    gaussians: MergedGaussians, cell: float, errors: Float[np.ndarray, " n"]
-) -> tuple[MergedGaussians, float]:
+def merge_cells(gaussians: NodeGaussians, cell: float, errors: Float[np.ndarray, " n"]) -> tuple[NodeGaussians, float]:
     """As many Gaussians as cells of space hold some, each for those that are nearest to what one cell holds, apart from
     those larger than a cell; and how far they then are from their true places: the root mean square by weight, on top
     of the `errors` that they had."""
@@ -188,21 +186,21 @@ class CameraTable:
         return [self._cameras[near[i]] for i in sorted(chosen)]
 
 
-def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[MergedGaussians, float]:
+def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[NodeGaussians, float]:
     """What a leaf draws instead of its anchors, and how far off it is."""
     baked = with_learnt_blur(bake_leaf(model, cameras), max(cameras.pixel, model.photograph_pixel))
     cell = edge / CELLS_PER_EDGE
     merged, error = merge_cells(
-        MergedGaussians(**baked.tensors(), covers=torch.ones(len(baked))), cell, np.zeros(len(baked))
+        NodeGaussians(**baked.tensors(), covers=torch.ones(len(baked))), cell, np.zeros(len(baked))
     )
     return merged, max(error, MIN_LEAF_ERROR * cell)
 
 
 def parent_gaussians(
-    children: Sequence[MergedGaussians], records: Sequence[NodeRecord], edge: float
-) -> tuple[MergedGaussians, float]:
+    children: Sequence[NodeGaussians], records: Sequence[NodeRecord], edge: float
+) -> tuple[NodeGaussians, float]:
     """What a node draws instead of its children, and how far off it is."""
-    together = MergedGaussians(
+    together = NodeGaussians(
         **{name: torch.cat([child.tensors()[name] for child in children]) for name in children[0].tensors()}
     )
     errors = np.repeat([record.error for record in records], [len(child) for child in children])

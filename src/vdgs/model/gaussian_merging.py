@@ -20,11 +20,11 @@ from torch import Tensor
 
 from vdgs.kernels.spherical_harmonics import SH_C0
 from vdgs.model.gaussian_transform import gaussian_covariances
-from vdgs.model.gaussians import AnyGaussians, Gaussians, MergedGaussians
+from vdgs.model.gaussians import AnyGaussians, Gaussians, NodeGaussians
 
 #: Opacities of merged Gaussians end here, as those that are drawn do.
 MAX_OPACITY = 0.999
-#: No more surfaces than so many are counted behind each other (`MergedGaussians`).
+#: No more surfaces than so many are counted behind each other (`NodeGaussians`).
 MAX_COVERS = 1e4
 #: Merged Gaussians are enlarged so much at most where they would cover less than their members.
 MAX_ENLARGED = 2.0
@@ -48,7 +48,7 @@ def merge_by_moments(
 
     Weight, mean and covariance of a group are conserved, coefficients of color are its weighted means. So is what it
     covers, opacity times area: where an opaque Gaussian of this covariance covers less, as on a closed surface, it is
-    larger, up to `enlarge` times, and `MergedGaussians` keep what is still missing. What is alone in its group stays as
+    larger, up to `enlarge` times, and `NodeGaussians` keep what is still missing. What is alone in its group stays as
     it is.
     """
     order = np.argsort(groups, kind="stable")
@@ -78,7 +78,7 @@ def merge_by_moments(
         "opacity_logits": torch.logit((opacity / larger).clamp(1e-6, MAX_OPACITY)),
         "log_scales": log_scales + larger.log()[:, None] / 2,
     }
-    if isinstance(gaussians, MergedGaussians):
+    if isinstance(gaussians, NodeGaussians):
         merged["covers"] = (opacity / larger / MAX_OPACITY).clamp(1, MAX_COVERS)
     first, alone = gaussians.select(torch.from_numpy(order[starts])), torch.from_numpy(sizes == 1)
     return replace(gaussians, **{
@@ -101,7 +101,7 @@ def merge_to(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:
 def gaussian_weights(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     """Opacity times area of each, or what its members cover; never 0."""
     opacities = gaussians.opacity_logits.double().sigmoid()
-    if isinstance(gaussians, MergedGaussians):
+    if isinstance(gaussians, NodeGaussians):
         opacities = opacities * gaussians.covers
     return np.maximum((opacities * _areas(gaussians)).numpy(), 1e-30)
 

@@ -67,7 +67,7 @@ class Gaussians:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergedGaussians(Gaussians):
+class NodeGaussians(Gaussians):
     """Gaussians that may stand for more than they can cover themselves, as where surfaces lie behind each other."""
 
     #: What the members cover, in parts of what the Gaussian covers where it is opaque; 1 where it is less.

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.model.anchors import Anchors
-from vdgs.model.gaussians import MergedGaussians
+from vdgs.model.gaussians import NodeGaussians
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import read_tensors, read_tensors_unchecked, tensors_crc32, write_tensors
 
@@ -99,16 +99,16 @@ def anchors_file(folder: Path, node: int) -> Path:
     return folder / "anchors" / f"{node:06d}.safetensors"
 
 
-def save_node(path: Path, gaussians: MergedGaussians, record: NodeRecord) -> None:
+def save_node(path: Path, gaussians: NodeGaussians, record: NodeRecord) -> None:
     """Write the merged Gaussians of a node: places in full, all else in half precision."""
     tensors = {name: t.half() if name != "means" else t for name, t in gaussians.tensors().items()}
     content = {**vars(record), "crc32": tensors_crc32(tensors)}
     write_atomic(path, lambda file: write_tensors(file, tensors, {NODE_FORMAT: json.dumps(content)}))
 
 
-def load_node(path: Path) -> MergedGaussians:
+def load_node(path: Path) -> NodeGaussians:
     """The merged Gaussians of a node, in float32. Raises VdgsError for a damaged file."""
-    return MergedGaussians(**{name: tensor.float() for name, tensor in _read(path, MergedGaussians).items()})
+    return NodeGaussians(**{name: tensor.float() for name, tensor in _read(path, NodeGaussians).items()})
 
 
 def save_anchors(path: Path, anchors: Anchors, rows: Int[np.ndarray, " r"]) -> None:
@@ -144,7 +144,7 @@ def _header(path: Path) -> dict[str, Any]:
         return content
 
 
-def _read(path: Path, kind: type[MergedGaussians] | type[Anchors]) -> dict[str, Tensor]:
+def _read(path: Path, kind: type[NodeGaussians] | type[Anchors]) -> dict[str, Tensor]:
     try:
         tensors = read_tensors_unchecked(path)
         if _header(path)["crc32"] != tensors_crc32(tensors):

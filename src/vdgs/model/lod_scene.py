@@ -15,7 +15,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
-from vdgs.model.gaussians import MergedGaussians, project_splats
+from vdgs.model.gaussians import NodeGaussians, project_splats
 from vdgs.model.lod_tree import LodCut, LodTree
 from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
 
@@ -44,7 +44,7 @@ class LodScene:
     #: beside a small part of a view.
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
-    _gaussians: dict[tuple[int, ...], MergedGaussians | None] = field(default_factory=dict)
+    _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -173,7 +173,7 @@ class LodScene:
             anchors = replace(anchors, opacity_factors=factors.to(anchors.positions))
         return (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
 
-    def _assemble_gaussians(self, nodes: tuple[int, ...]) -> MergedGaussians | None:
+    def _assemble_gaussians(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
         found = self.tree.gaussians_of(nodes)
         if found is not None and self.fade is not None:
@@ -201,7 +201,7 @@ def _held(
     return content
 
 
-def merged_splats(gaussians: MergedGaussians, camera: Camera) -> Splats:
+def merged_splats(gaussians: NodeGaussians, camera: Camera) -> Splats:
     """The splats of merged Gaussians in a view, without aliasing: the blur that the model has learnt is part of them
     (`export.lod_bake`). One that covers several times as much as itself is drawn as so many behind each other, each as
     transparent as the blur makes it."""

@@ -24,7 +24,7 @@ from torch import Tensor
 from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
 from vdgs.model.anchors import Anchors
-from vdgs.model.gaussians import MergedGaussians
+from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_nodes import TREE_FILE, LodTable, anchors_file, load_anchors, load_node, node_file
 
 #: Nodes are kept in memory up to so many bytes.
@@ -150,7 +150,7 @@ class LodTree:
         other._cache = _NodeCache(cache_bytes)
         return other
 
-    def gaussians(self, node: int) -> MergedGaussians:
+    def gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node."""
         return self._cache.get(("nodes", node), lambda: load_node(node_file(self.folder, node)), _bytes)
 
@@ -160,10 +160,10 @@ class LodTree:
             ("anchors", leaf), lambda: load_anchors(anchors_file(self.folder, leaf)), lambda content: _bytes(content[0])
         )
 
-    def gaussians_of(self, nodes: tuple[int, ...]) -> MergedGaussians | None:
+    def gaussians_of(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes, one after another."""
         parts = [self.gaussians(node) for node in nodes]
-        return _joined(MergedGaussians, parts) if parts else None
+        return _joined(NodeGaussians, parts) if parts else None
 
     def anchors_of(
         self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]
@@ -227,7 +227,7 @@ class _NodeCache:
         return content
 
 
-_Kind = TypeVar("_Kind", MergedGaussians, Anchors)
+_Kind = TypeVar("_Kind", NodeGaussians, Anchors)
 
 
 def _joined(kind: type[_Kind], parts: list[_Kind]) -> _Kind:
@@ -235,5 +235,5 @@ def _joined(kind: type[_Kind], parts: list[_Kind]) -> _Kind:
     return parts[0] if len(parts) == 1 else kind(**{n: torch.cat([p.tensors()[n] for p in parts]) for n in names})
 
 
-def _bytes(content: MergedGaussians | Anchors) -> int:
+def _bytes(content: NodeGaussians | Anchors) -> int:
     return reduce(lambda total, tensor: total + tensor.nbytes, content.tensors().values(), 0)
