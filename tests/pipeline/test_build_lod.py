@@ -24,7 +24,7 @@ from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decoder import Decoder
 from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
 from vdgs.model.gaussians import NodeGaussians
-from vdgs.model.lod_nodes import TREE_FILE
+from vdgs.model.lod_nodes import LOD_FORMAT, TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
 from vdgs.model.lod_scene import LodScene, merged_splats
 from vdgs.model.lod_tree import LodTree
@@ -35,7 +35,7 @@ from vdgs.runs.lod_folder import find_tree, open_tree
 from vdgs.runs.open_run import ModelLocation, open_mapped
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
-from vdgs.system.tensors import file_id
+from vdgs.system.tensors import file_id, read_tensors, write_tensors
 
 CAMERAS = [
     camera_at(x, y, 5.0, 15.0, 90.0 * number) for number, (x, y) in enumerate([(-2, -2), (2, -2), (2, 2), (-2, 2)])
@@ -255,6 +255,15 @@ def test_a_damaged_node_is_named(scene, tmp_path):
     file.write_bytes(content)
     with pytest.raises(VdgsError, match=r"000000\.safetensors: is missing or damaged.*vdgs lod"):
         render(LodScene(LodTree(folder), scene.model, 1000.0), VIEWS[0])
+
+
+def test_a_tree_of_another_version_is_made_again(scene, tmp_path):
+    folder = Path(shutil.copytree(scene.tree.folder, tmp_path / "lod"))
+    tensors, header = read_tensors(folder / TREE_FILE)
+    copied = {name: tensor.clone() for name, tensor in tensors.items()}  # from the file that is written anew
+    write_tensors(folder / TREE_FILE, copied, {"vdgs-lod-2": header[LOD_FORMAT]})
+    with pytest.raises(VdgsError, match=r"is of another version of vdgs\. Make it again: vdgs lod RUN"):
+        LodTree(folder)
 
 
 def test_a_scene_that_no_camera_shows_has_a_tree(tmp_path):
