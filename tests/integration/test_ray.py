@@ -131,6 +131,8 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
     command = (*on_ray(run, cluster), "--mem-gb", "1")
     with begun(*command, pause_at=(MIDDLE, 1), prepare=more_retries, environment=cluster.token) as driver:
         processes = waiting_shards(driver, 2)
+        # The driver knows of both attempts: what it has not heard of yet it cannot lose.
+        wait_until(lambda: all(f"block 0{block}: started" in driver.printed() for block in range(2)))
         cluster.remove(cluster.node_of(processes[1]))
         wait_until(lambda: not alive(processes[1]))
         cluster.add("stranger", {"PYTHONPATH": os.pathsep.join(map(str, (stranger, TESTS)))})
@@ -143,7 +145,7 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
         wait_until(lambda: any(cluster.has(process, "large") for process in driver.paused()))
         os.kill(processes[0], signal.SIGKILL)
         again = waits_again(driver, 0, processes[0])
-        # The driver knows of the second attempt: what it has not heard of yet it cannot lose.
+        # As above, of the second attempt.
         wait_until(lambda: driver.printed().count("block 00: started") == 2)
         os.kill(keeper_of(again), signal.SIGKILL)
         slow = waits_again(driver, 0, processes[0], again)
