@@ -79,6 +79,7 @@ def _opened(file: Path) -> Iterator[IO[bytes]]:
                     raise CaptureError(f"{file}: holds no XML file.")
                 with archive.open(_DOCUMENT if _DOCUMENT in names else names[0]) as stream:
                     yield _in_utf8(stream)
+        # What zipfile raises for a damaged file, a compression that it lacks (NotImplementedError) and a password.
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error, EOFError) as error:
             raise CaptureError(f"{file}: is no zip file that can be read ({error}). Copy it again.") from None
 
