@@ -45,8 +45,9 @@ TIMES = ("fps", "render_seconds", "seconds", "peak_memory_bytes")
 #: How the end of a command is told that was killed. Where the machine, whose count is that of all its processes, has
 #: meanwhile killed any for want of memory, this one may be taken for one of them.
 KILLED = r"crashed by SIGKILL( \(out of memory; [^)]*\))?"
-#: How the loss of a node is told, by what Ray says first: that the node has died, or that its worker does not answer.
-NODE_LOST = r"crashed by the loss of its (node|worker on node)"
+#: How the loss of a node is told, by what Ray says first: that the node has died, that its worker does not answer, or,
+#: where the worker ends late, that the worker has killed its command.
+NODE_LOST = rf"(crashed by the loss of its (node|worker on node)|{KILLED})"
 
 #: Serves commands, one line each: starts and removes nodes. Nodes have one processor; the head has none.
 SERVER = """

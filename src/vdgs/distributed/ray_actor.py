@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,9 @@ from vdgs.system.documents import FitnessQuestion
 
 #: Seconds that the result of a command waits for a driver.
 RESULT_TIMEOUT_SECONDS = 300.0
+#: A worker whose node is lost kills its children, then ends itself. A killed command is reported only after so many
+#: seconds, so that the driver hears of the node instead.
+KILLED_WITH_WORKER_SECONDS = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +83,10 @@ class RayTaskActor:
             return None
         code = process.wait()
         threading.Thread(target=self._exit_unless_collected, daemon=True).start()
-        killed = code == -signal.SIGKILL and oom_kill_count() > self._oom_kills
-        return AttemptResult(code, out_of_memory=killed)
+        if code != -signal.SIGKILL:
+            return AttemptResult(code)
+        time.sleep(KILLED_WITH_WORKER_SECONDS)
+        return AttemptResult(code, out_of_memory=oom_kill_count() > self._oom_kills)
 
     def stop(self) -> None:
         """Ask the command to save and end, once."""
