@@ -79,7 +79,7 @@ def test_a_file_keeps_parts(tmp_path):
         assert all(torch.equal(t, theirs.decoder.tensors()[name]) for name, t in ours.decoder.tensors().items())
     plain = model_at(scattered())
     plain.save(tmp_path / "plain.safetensors")
-    faded = replace(plain.anchors, opacity_factors=torch.zeros(len(plain.anchors)))
+    faded = replace(plain.anchors, opacity_factors=torch.zeros(plain.anchors.offsets.shape[:2]))
     replace(plain, anchors=faded).save(tmp_path / "faded.safetensors")
     assert (tmp_path / "faded.safetensors").read_bytes() == (tmp_path / "plain.safetensors").read_bytes()
     assert AnchorModel.load(tmp_path / "plain.safetensors").decoder_spans == ()

@@ -21,6 +21,7 @@ from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.export.lod_bake import CameraTable, merge_cells
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
+from vdgs.model.decode_world import gaussian_means
 from vdgs.model.decoder import Decoder
 from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
 from vdgs.model.gaussians import NodeGaussians
@@ -98,18 +99,20 @@ def test_without_any_error_the_picture_is_that_of_the_model_to_the_last_bit(scen
 
 
 def test_places_that_have_faded_out_are_not_drawn_and_have_no_values(scene, model):
-    """As the viewer leaves out what few cameras see: of anchors and of merged Gaussians alike."""
-    camera, half = camera_at(0.0, 0.0, 6.0), scene.with_fade(lambda _, places: (places[:, 0] > 0).float())
-    kept = model.select_anchors(model.anchors.positions[:, 0] > 0)
+    """As the viewer leaves out what few cameras see: of Gaussians of anchors and of merged ones alike."""
+    camera, half = camera_at(0.0, 0.0, 6.0), scene.with_fade(lambda places: (places[:, 0] > 0).float())
+    factors = (gaussian_means(model.anchors)[..., 0] > 0).float()
+    faded = replace(model, anchors=replace(model.anchors, opacity_factors=factors))
     exact = render(half.at_error(0.0), camera).image
-    assert torch.equal(exact, render(kept, camera).image)
+    assert torch.equal(exact, render(faded, camera).image)
+    left = model.anchors.positions[factors.any(1), 0]
     for error in (0.0, 2.0, 50.0):
         drawn = half.at_error(error)
         x = drawn.values(camera, lambda _, places: places[:, 0])
         assert len(x)
-        assert bool((x > 0).all())
+        assert bool(((x > 0) | torch.isin(x, left)).all())
         assert int(drawn.view_splats(camera)[0].max()) < len(x)
-    half = scene.with_fade(lambda _, places: torch.full((len(places),), 0.5))
+    half = scene.with_fade(lambda places: torch.full((len(places),), 0.5))
     for error in (0.0, 2.0, 50.0):
         whole, drawn = (each.at_error(error).view_splats(camera)[1].opacities for each in (scene, half))
         torch.testing.assert_close(drawn, whole / 2, atol=1e-6, rtol=1e-5)

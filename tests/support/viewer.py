@@ -33,7 +33,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import render
 from vdgs.runs.visibility_store import with_fade
 from vdgs.viewer.server import ViewerServer
-from vdgs.visibility.visibility_counts import FADE_BELOW, count_visibility
+from vdgs.visibility.visibility_counts import FADE_BELOW
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: A busy machine may need long; nothing waits so long where all is well.
@@ -56,7 +56,7 @@ def trained(folder: Path) -> Path:
 def expected(viewer: ViewerServer, camera: Camera) -> np.ndarray:
     run = viewer.scene.run
     cameras = [view.camera for view in run.capture.train_views]
-    shown = with_fade(run.model, count_visibility(run.model.anchors.positions, cameras), cameras, FADE_BELOW)
+    shown = with_fade(run.model, cameras, FADE_BELOW)
     return to_8bit(render(shown, camera).image.numpy())
 
 

@@ -10,13 +10,14 @@ import torch
 from support.captures import camera_at
 from support.hand_made_models import two_floors
 from vdgs.model.anchor_model import DecoderSpan
+from vdgs.model.decode_world import gaussian_means
 from vdgs.model.renderer import render
 from vdgs.viewer.lod import LodPyramid
 
 
 def test_levels_of_a_model_that_fades_out_fade_out():
     model, camera = two_floors(), camera_at(0.0, 0.0, 6.0)
-    west = (model.anchors.positions[:, 0] < 0).float()
+    west = (gaussian_means(model.anchors)[..., 0] < 0).float()
     levels = LodPyramid(replace(model, anchors=replace(model.anchors, opacity_factors=west)))
     for most in (None, 100):
         level, _ = levels.of(camera, most)

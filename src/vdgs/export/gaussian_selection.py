@@ -32,7 +32,7 @@ def with_faded_edge(run: OpenedRun, request: ExportRequest) -> OpenedRun:
     cameras = [view.camera for view in run.capture.train_views]
     visibility = get_run_visibility(run, cameras)
     require_some_seen(visibility, request.min_visibility)
-    return replace(run, model=with_fade(run.model, visibility, cameras, request.min_visibility))
+    return replace(run, model=with_fade(run.model, cameras, request.min_visibility))
 
 
 def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: ExportRequest) -> Int[np.ndarray, " m"]:

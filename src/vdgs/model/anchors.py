@@ -25,9 +25,9 @@ class Anchors:
     log_scales: Float[Tensor, "n 6"]
     #: The largest pixel, in units of the ground frame, in which each anchor is drawn (`model.levels`); None: in any.
     max_pixels: Float[Tensor, " n"] | None = None
-    #: What opacities are multiplied with where a scene fades out at its edge (`visibility_fade`); None: nothing. In
-    #: memory only: no model has it in its file.
-    opacity_factors: Float[Tensor, " n"] | None = None
+    #: What the opacities of the k Gaussians are multiplied with where a scene fades out at its edge (`fade_factors`);
+    #: None: nothing. In memory only: no model has it in its file.
+    opacity_factors: Float[Tensor, "n k"] | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]

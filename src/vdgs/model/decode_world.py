@@ -47,7 +47,7 @@ def decode_world(
     covariance = weights.covariance.forward(inputs).unflatten(1, (k, 7))
     opacities = weights.opacity.forward(inputs).tanh()
     if anchors.opacity_factors is not None:
-        opacities = opacities * anchors.opacity_factors[rows, None]
+        opacities = opacities * anchors.opacity_factors[rows]
     return DecodedGaussians(
         opacities,
         weights.color.forward(inputs).unflatten(1, (k, 3)).sigmoid(),

@@ -15,6 +15,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
+from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import NodeGaussians, project_splats
 from vdgs.model.lod_tree import LodCut, LodTree
 from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
@@ -38,13 +39,15 @@ class LodScene:
     view: Camera | None = None
     #: Of the photographs, where anchors are drawn without aliasing (`Antialiased`): merged Gaussians always are.
     pixel: float | None = None
-    #: What opacities are multiplied with, asked for as by `values`; None: nothing.
-    fade: Callable[[NodeContent, Tensor], Tensor] | None = None
+    #: What opacities are multiplied with, by the places of Gaussians; None: nothing.
+    fade: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]] | None = None
     #: Of a leaf only those anchors are put together that a view may show, and they alone are places: most of a leaf is
     #: beside a small part of a view.
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
     _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
+    #: By what opacities are multiplied, for the Gaussians of what was drawn once.
+    _factors: dict[NodeContent, Tensor] = field(default_factory=dict)
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -79,9 +82,9 @@ class LodScene:
         """The same scene, its anchors drawn as `renderer.Antialiased` draws them."""
         return replace(self, pixel=pixel)
 
-    def with_fade(self, factors: Callable[[NodeContent, Tensor], Tensor]) -> LodScene:
-        """The same scene, opacities multiplied with these; places of 0 are left out."""
-        return replace(self, fade=factors, _anchors={}, _gaussians={})
+    def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]]) -> LodScene:
+        """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other."""
+        return replace(self, fade=factors, _anchors={}, _gaussians={}, _factors={})
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -118,8 +121,9 @@ class LodScene:
         if cut.leaves:
             found.append(self._leaf_values(cut.leaves, camera, of))
         if cut.nodes:
-            values = self._node_values(cut.nodes, of)
-            found.append(values if self.fade is None else values[self._node_values(cut.nodes, self.fade) > 0])
+            values = torch.cat([of(("nodes", node), self.tree.gaussians(node).means) for node in cut.nodes])
+            factors = self._node_factors(cut.nodes)
+            found.append(values if factors is None else values[factors > 0])
         return torch.cat(found) if found else torch.zeros(0)
 
     def _leaf_values(
@@ -135,21 +139,38 @@ class LodScene:
             found.append(values if mask is None else values[mask])
         return torch.cat(found)[torch.cat(rows).argsort()]
 
-    def _leaf_factors(self, leaf: int, anchors: Anchors) -> Tensor | None:
-        return None if self.fade is None else self.fade(("anchors", leaf), anchors.positions)
+    def _leaf_factors(self, leaf: int, anchors: Anchors) -> Float[Tensor, "a k"] | None:
+        """What the opacities of the Gaussians of a leaf's anchors are multiplied with; None: nothing."""
+        found = self._content_factors(("anchors", leaf), lambda: gaussian_means(anchors).flatten(0, 1))
+        return None if found is None else found.view(anchors.offsets.shape[:2])
 
     def _leaf_mask(self, anchors: Anchors, factors: Tensor | None, camera: Camera) -> Tensor | None:
         """Which anchors of a leaf are put together for a view; None: all."""
-        mask = None if factors is None else factors > 0
+        mask = None if factors is None else (factors > 0).any(1)
         if self.culls_leaves:
             seen = torch.zeros(len(anchors), dtype=torch.bool)
             seen[cull_anchors(anchors, replace(camera, photograph_pixel=self.model.photograph_pixel))] = True
             mask = seen if mask is None else mask & seen
         return mask
 
-    def _node_values(self, nodes: tuple[int, ...], of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
-        """Values of the merged Gaussians of some nodes."""
-        return torch.cat([of(("nodes", node), self.tree.gaussians(node).means) for node in nodes])
+    def _node_factors(self, nodes: tuple[int, ...]) -> Float[Tensor, " m"] | None:
+        """What the opacities of the merged Gaussians of some nodes are multiplied with; None: nothing."""
+
+        def means(node: int) -> Tensor:
+            return self.tree.gaussians(node).means
+
+        found = [self._content_factors(("nodes", node), partial(means, node)) for node in nodes]
+        return None if self.fade is None else torch.cat([each for each in found if each is not None])
+
+    def _content_factors(self, content: NodeContent, places: Callable[[], Tensor]) -> Float[Tensor, " p"] | None:
+        """`fade` of the places of a node, asked for once."""
+        if self.fade is None:
+            return None
+        if content not in self._factors:
+            counted = self.fade(places())
+            is_inside = bool((counted == 1).all())  # as most nodes are: one figure for all their Gaussians
+            self._factors[content] = (counted.new_ones(1).expand(len(counted)) if is_inside else counted).half()
+        return self._factors[content]
 
     def _cut(self, camera: Camera) -> LodCut:
         cut = self._cut_of(camera)
@@ -170,14 +191,13 @@ class LodScene:
         factors = self._leaf_factors(leaf, anchors)
         mask = self._leaf_mask(anchors, factors, camera)
         if factors is not None:
-            anchors = replace(anchors, opacity_factors=factors.to(anchors.positions))
+            anchors = replace(anchors, opacity_factors=factors)
         return (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
 
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
         found = self.tree.gaussians_of(nodes)
-        if found is not None and self.fade is not None:
-            factors = self._node_values(nodes, self.fade)
+        if found is not None and (factors := self._node_factors(nodes)) is not None:
             drawn = factors > 0
             found = found.select(drawn)
             opacities = found.opacity_logits.sigmoid() * factors[drawn].to(found.opacity_logits)

@@ -137,7 +137,7 @@ def decode_view(
         named = {name: torch.cat([getattr(each, name) for _, each in parts]) for name in (*SPLAT_TENSORS, "volumes")}
         splats = AnchorSplats(**named, source=torch.cat([each.source + first * k for first, each in parts]))
     if model.anchors.opacity_factors is not None:
-        factors = model.anchors.opacity_factors[rows][splats.source.long() // k]
+        factors = model.anchors.opacity_factors[rows].flatten()[splats.source.long()]
         splats = replace(splats, opacities=splats.opacities * factors)
     return rows, splats
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt8
 from rich.console import Console
-from torch import Tensor
 
 from vdgs.captures.camera_height import pixel_at_camera_height
 from vdgs.captures.capture_metadata import check_same_capture
@@ -21,7 +20,7 @@ from vdgs.evaluation.comparison_images import unique_file_stems, write_png
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.lod_scene import LodScene, NodeContent
+from vdgs.model.lod_scene import LodScene
 from vdgs.model.renderer import Drawable, render, without_aliasing
 from vdgs.rendering import camera_paths
 from vdgs.rendering.path_io import load_path
@@ -38,7 +37,7 @@ from vdgs.system.console import track
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
-from vdgs.visibility.visibility_counts import FADE_BELOW, NearbyCameras, count_visibility, fade_factors
+from vdgs.visibility.visibility_counts import FADE_BELOW, NearbyCameras, count_visibility
 
 #: Frames a second of a video of separate views.
 STILLS_FPS = 2.0
@@ -134,13 +133,8 @@ def _with_fade(request: RenderRequest, run: OpenedModel, scene: Drawable, camera
         return scene
     if isinstance(scene, LodScene):
         nearby = NearbyCameras(cameras)
-
-        def factors(_: NodeContent, places: Tensor) -> Tensor:
-            near = nearby.of(places)
-            return fade_factors(places, count_visibility(places, near), near, least)
-
-        return scene.with_fade(factors)
-    return with_fade(run.model, visibility, cameras, least)
+        return scene.with_fade(lambda places: nearby.fade_factors(places, least))
+    return with_fade(run.model, cameras, least)
 
 
 def _check(request: RenderRequest) -> None:

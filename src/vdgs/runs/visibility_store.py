@@ -13,6 +13,7 @@ from torch import Tensor
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.decode_world import gaussian_means
 from vdgs.runs.open_run import OpenedModel, OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import write_atomic
@@ -35,12 +36,11 @@ def get_run_visibility(opened: OpenedModel, cameras: Sequence[Camera]) -> Int32[
     return saved.to(opened.device)
 
 
-def with_fade(
-    model: AnchorModel, visibility: Real[Tensor, " n"], cameras: Sequence[Camera], min_visibility: int
-) -> AnchorModel:
-    """A model that fades out where fewer than `min_visibility` training cameras see it: nothing fixes depths there. It
-    shares the tensors of the other one."""
-    factors = fade_factors(model.anchors.positions, visibility, cameras, min_visibility)
+def with_fade(model: AnchorModel, cameras: Sequence[Camera], min_visibility: int) -> AnchorModel:
+    """A model whose Gaussians fade out where fewer than `min_visibility` training cameras see them: nothing fixes
+    depths there. It shares the tensors of the other one."""
+    means = gaussian_means(model.anchors)
+    factors = fade_factors(means.flatten(0, 1), cameras, min_visibility).view(means.shape[:2])
     return replace(model, anchors=replace(model.anchors, opacity_factors=factors))
 
 

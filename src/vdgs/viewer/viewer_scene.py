@@ -30,7 +30,7 @@ from vdgs.runs.lod_folder import find_tree
 from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
 from vdgs.runs.visibility_store import get_run_visibility, with_fade
 from vdgs.viewer.lod import LodLevel, LodPyramid
-from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility, fade_factors
+from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility
 
 ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
@@ -143,20 +143,9 @@ class ViewerScene:
 
         def fade_out() -> LodScene:
             least = min(min_visibility, int(self.visibility_sample(name).max()))
-            held: dict[NodeContent, Tensor] = {}  # gone with the tree
-
-            def factors(content: NodeContent, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-                if content not in held:
-                    held[content] = self._count_fade(least, places)
-                return held[content]
-
-            return tree.with_fade(factors)
+            return tree.with_fade(lambda places: self._nearby.fade_factors(places, least))
 
         return _keep_last(self._faded_trees, (name, min_visibility), fade_out)
-
-    def _count_fade(self, min_visibility: int, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-        cameras = self._nearby.of(places)
-        return fade_factors(places, count_visibility(places, cameras), cameras, min_visibility)
 
     def _pyramid(self, name: str, min_visibility: int) -> LodPyramid:
         """The levels of a model without a tree."""
@@ -168,8 +157,7 @@ class ViewerScene:
         model = self.model(name)
         if not min_visibility or not len(model.anchors):
             return model
-        visibility = self.visibility(name)
-        return with_fade(model, visibility, self._cameras, min(min_visibility, int(visibility.max())))
+        return with_fade(model, self._cameras, min(min_visibility, int(self.visibility(name).max())))
 
     @property
     def _cameras(self) -> list[Camera]:

@@ -7,15 +7,16 @@ the cameras of a growth cycle).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Int32, Real
+from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from vdgs.geometry.camera import Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels import get_backend
 
 #: Percentiles and limits by which visibility is described.
@@ -25,9 +26,8 @@ LOW_VISIBILITY_LIMITS = (3, 5, 10)
 EPSILON = 1e-8
 #: In the viewer and in films a scene fades out where fewer cameras see it (choice): two are needed to fix a depth.
 FADE_BELOW = 2
-#: It has faded out where it lies so far beyond a picture's edge, as a share of the longer side, and V is counted at so
-#: many places in between (choice).
-FADE_MARGIN, FADE_STEPS = 0.15, 8
+#: It has faded out where it lies so far beyond a picture's edge, as a share of the longer side (choice).
+FADE_MARGIN = 0.15
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,49 @@ def count_visibility(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera])
 
 
 def fade_factors(
-    positions: Float[Tensor, "n 3"], visibility: Real[Tensor, " n"], cameras: Sequence[Camera], min_visibility: int
+    positions: Float[Tensor, "n 3"], cameras: Sequence[Camera], min_visibility: int
 ) -> Float[Tensor, " n"]:
     """What opacities are multiplied with where a scene fades out at its edge, by V of each place: 1 where at least
     `min_visibility` cameras hold it; farther out it falls smoothly to 0, by how much larger pictures would have to be
     for so many to hold it."""
-    factors, rare = torch.ones_like(positions[:, 0]), torch.nonzero(visibility < min_visibility)[:, 0]
-    held, left = torch.zeros_like(factors), rare
-    for step in reversed(range(FADE_STEPS)):  # the widest pictures first: what they do not hold, no others hold
-        if not len(left):
-            break
-        wide = [_widened(each, FADE_MARGIN * (step + 0.5) / FADE_STEPS) for each in cameras]
-        left = left[count_visibility(positions[left], wide) >= min_visibility]
-        held[left] += 1 / FADE_STEPS
-    factors[rare] = (held * held * (3 - 2 * held))[rare]
+    factors = (count_visibility(positions, cameras) >= min_visibility).to(positions)
+    edge = torch.nonzero(factors == 0)[:, 0]
+    edge = edge[count_visibility(positions[edge], [_widened(each) for each in cameras]) >= min_visibility]
+    outside = [torch.full_like(factors[edge], math.inf) for _ in range(min_visibility)]  # ascending
+    places = positions[edge].T.contiguous()
+    for camera in cameras:
+        more = _share_outside(places, camera)
+        for k, least in enumerate(outside):
+            outside[k], more = torch.minimum(least, more), torch.maximum(least, more)
+    for last in outside[-1:]:
+        held = (1 - last / FADE_MARGIN).clamp(0, 1)
+        factors[edge] = held * held * (3 - 2 * held)
     return factors
+
+
+def _widened(camera: Camera) -> Camera:
+    """A camera whose picture shows all on each side that has not faded out."""
+    more = math.ceil(FADE_MARGIN * max(camera.width, camera.height))
+    return replace(
+        camera, width=camera.width + 2 * more, height=camera.height + 2 * more, cx=camera.cx + more,
+        cy=camera.cy + more, uncropped_size=None,
+    )  # fmt: skip
+
+
+def _share_outside(places: Float[Tensor, "3 n"], camera: Camera) -> Float[Tensor, " n"]:
+    """How far places lie outside of a picture, in its longer sides; infinite behind the camera, 0 or less inside."""
+    longest, is_pinhole = max(camera.width, camera.height), camera.model == "pinhole"
+    fx, cx, half_width = camera.fx / longest, (camera.cx - camera.width / 2) / longest, camera.width / 2 / longest
+    fy, cy, half_height = camera.fy / longest, (camera.cy - camera.height / 2) / longest, camera.height / 2 / longest
+    lens = np.array([[fx, 0, cx * is_pinhole], [0, fy, cy * is_pinhole], [0, 0, 1]])  # from the picture's middle
+    pose = torch.from_numpy(lens @ camera.camera_from_world[:3]).to(places)
+    column, row, z = torch.addmm(pose[:, 3:], pose[:, :3], places)
+    if is_pinhole:
+        column, row = column.div_(z), row.div_(z)
+    else:
+        column, row = column.add_(cx), row.add_(cy)
+    outside = torch.maximum(column.abs_().sub_(half_width), row.abs_().sub_(half_height))
+    return torch.where(z > NEAR_PLANE, outside, math.inf)
 
 
 class NearbyCameras:
@@ -76,38 +104,55 @@ class NearbyCameras:
         self._cameras = list(cameras)
         self._poses = np.array([each.camera_from_world for each in cameras]).reshape(-1, 4, 4)
         self._is_pinhole = np.array([each.model == "pinhole" for each in cameras], bool)
-        # Planes through the camera's center and the edges of its widened picture, normals inwards: left, right, ...
         lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras]).reshape(-1, 6).T
-        fx, fy, cx, cy, width, height = lenses
-        more = FADE_MARGIN * np.maximum(width, height) + 1
-        zero = np.zeros_like(fx)
-        planes = np.stack([
-            np.stack([fx, zero, cx + more], -1), np.stack([-fx, zero, width - cx + more], -1),
-            np.stack([zero, fy, cy + more], -1), np.stack([zero, -fy, height - cy + more], -1),
-        ], 1)  # fmt: skip
-        self._planes = planes / np.linalg.norm(planes, axis=2, keepdims=True)
+        #: Of the pictures widened by `FADE_MARGIN`, and of the pictures; a pixel more and less: no rounding counts.
+        self._widened = _picture_planes(lenses, FADE_MARGIN * np.maximum(*lenses[4:]) + 1)
+        self._planes = _picture_planes(lenses, -1.0)
 
     def of(self, positions: Float[Tensor, "p 3"]) -> list[Camera]:
         """Those whose pictures, widened by `FADE_MARGIN`, reach the sphere about these places; others count none."""
         if not len(positions):
             return []
-        low, high = (bound.double().cpu().numpy() for bound in torch.aminmax(positions.detach(), dim=0))
-        radius = float(np.linalg.norm(high - low)) / 2
+        center, radius = self._sphere(positions)
         if not np.isfinite(radius):
             return self._cameras
-        center = self._poses[:, :3, :3] @ ((low + high) / 2) + self._poses[:, :3, 3]
-        inside = (self._planes * center[:, None]).sum(2).min(axis=1, initial=np.inf) >= -radius
+        inside = _least_distances(self._widened, center) >= -radius
         reached = ~self._is_pinhole | (inside & (center[:, 2] >= -radius))
         return [self._cameras[k] for k in np.flatnonzero(reached)]
 
+    def fade_factors(self, positions: Float[Tensor, "p 3"], min_visibility: int) -> Float[Tensor, " p"]:
+        """`fade_factors` of all the cameras. Where enough of them hold the whole sphere about the places, or too few
+        reach it, none of these is looked at."""
+        if len(near := self.of(positions)) < min_visibility:
+            return positions.new_zeros(len(positions))
+        center, radius = self._sphere(positions)
+        hold = (_least_distances(self._planes, center) > radius) & (center[:, 2] > radius + NEAR_PLANE)
+        if (hold & self._is_pinhole).sum() >= min_visibility:
+            return positions.new_ones(len(positions))
+        return fade_factors(positions, near, min_visibility)
 
-def _widened(camera: Camera, margin: float) -> Camera:
-    """A camera whose picture shows more on each side, by a share of its longer side."""
-    more = max(1, round(margin * max(camera.width, camera.height)))
-    return replace(
-        camera, width=camera.width + 2 * more, height=camera.height + 2 * more, cx=camera.cx + more,
-        cy=camera.cy + more, uncropped_size=None,
-    )  # fmt: skip
+    def _sphere(self, positions: Float[Tensor, "p 3"]) -> tuple[Float[np.ndarray, "c 3"], float]:
+        """The center of a sphere about some places, from each camera, and its radius."""
+        low, high = (bound.double().cpu().numpy() for bound in torch.aminmax(positions.detach(), dim=0))
+        center = self._poses[:, :3, :3] @ ((low + high) / 2) + self._poses[:, :3, 3]
+        return center, float(np.linalg.norm(high - low)) / 2
+
+
+def _picture_planes(lenses: Float[np.ndarray, "6 c"], more: Float[np.ndarray, " c"] | float) -> np.ndarray:
+    """Planes [c, 4, 3] through the centers of cameras (fx, fy, cx, cy, width, height) and the edges of their pictures,
+    so many pixels larger on each side: left, right, top, bottom, normals inwards."""
+    fx, fy, cx, cy, width, height = lenses
+    zero = np.zeros_like(fx)
+    planes = np.stack([
+        np.stack([fx, zero, cx + more], -1), np.stack([-fx, zero, width - cx + more], -1),
+        np.stack([zero, fy, cy + more], -1), np.stack([zero, -fy, height - cy + more], -1),
+    ], 1)  # fmt: skip
+    return planes / np.linalg.norm(planes, axis=2, keepdims=True)
+
+
+def _least_distances(planes: Float[np.ndarray, "c 4 3"], center: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, " c"]:
+    """How far inside of its planes a place is, from each camera."""
+    return (planes * center[:, None]).sum(2).min(axis=1, initial=np.inf)
 
 
 def visibility_sampling_weights(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
