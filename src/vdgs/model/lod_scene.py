@@ -17,13 +17,15 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import NodeGaussians, project_splats
-from vdgs.model.lod_tree import LodCut, LodTree
+from vdgs.model.lod_tree import LodCut, LodTree, NodeCache
 from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
 #: So many of each are kept assembled: those of the last full picture, and those of a preview.
 MAX_ASSEMBLED = 2
+#: By what opacities are multiplied is kept for nodes up to so many bytes.
+FACTOR_CACHE_BYTES = 48 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +48,8 @@ class LodScene:
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
     _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
-    #: By what opacities are multiplied, for the Gaussians of what was drawn once.
-    _factors: dict[NodeContent, Tensor] = field(default_factory=dict)
+    #: By what opacities are multiplied, for the Gaussians of what was drawn last.
+    _factors: NodeCache = field(default_factory=lambda: NodeCache(FACTOR_CACHE_BYTES))
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -84,7 +86,7 @@ class LodScene:
 
     def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]]) -> LodScene:
         """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other."""
-        return replace(self, fade=factors, _anchors={}, _gaussians={}, _factors={})
+        return replace(self, fade=factors, _anchors={}, _gaussians={}, _factors=NodeCache(FACTOR_CACHE_BYTES))
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -163,14 +165,16 @@ class LodScene:
         return None if self.fade is None else torch.cat([each for each in found if each is not None])
 
     def _content_factors(self, content: NodeContent, places: Callable[[], Tensor]) -> Float[Tensor, " p"] | None:
-        """`fade` of the places of a node, asked for once."""
-        if self.fade is None:
+        """`fade` of the places of a node; what was asked for lately is kept."""
+        if (fade := self.fade) is None:
             return None
-        if content not in self._factors:
-            counted = self.fade(places())
-            is_inside = bool((counted == 1).all())  # as most nodes are: one figure for all their Gaussians
-            self._factors[content] = (counted.new_ones(1).expand(len(counted)) if is_inside else counted).half()
-        return self._factors[content]
+
+        def counted() -> Tensor:
+            factors = fade(places()).half()
+            is_inside = bool((factors == 1).all())  # as most nodes are: one figure for all their Gaussians
+            return factors.new_ones(1).expand(len(factors)) if is_inside else factors
+
+        return self._factors.get(content, counted, lambda factors: factors.untyped_storage().nbytes())
 
     def _cut(self, camera: Camera) -> LodCut:
         cut = self._cut_of(camera)

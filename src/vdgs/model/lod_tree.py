@@ -52,7 +52,7 @@ class LodTree:
 
     def __init__(self, folder: Path, cache_bytes: int = CACHE_BYTES) -> None:
         self.folder, self.table = folder, LodTable.load(folder / TREE_FILE)
-        self._cache = _NodeCache(cache_bytes)
+        self._cache = NodeCache(cache_bytes)
         self._is_leaf = self.table.anchors > 0
         self._parent = np.maximum(self.table.parent, 0)
         self._levels = _levels(self.table.parent)
@@ -147,7 +147,7 @@ class LodTree:
     def with_own_cache(self, cache_bytes: int) -> LodTree:
         """The same tree, whose nodes do not take the place of those that this one keeps in memory."""
         other = copy(self)
-        other._cache = _NodeCache(cache_bytes)
+        other._cache = NodeCache(cache_bytes)
         return other
 
     def gaussians(self, node: int) -> NodeGaussians:
@@ -204,7 +204,7 @@ def _levels(parent: Int[np.ndarray, " t"]) -> list[Int[np.ndarray, " n"]]:
     return [np.flatnonzero(depth == level) for level in range(depth.max(), 0, -1)]
 
 
-class _NodeCache:
+class NodeCache:
     """Contents of nodes, up to so many bytes: those used longest ago go first."""
 
     def __init__(self, max_bytes: int) -> None:
