@@ -76,6 +76,8 @@ def test_a_scene_fades_out_smoothly_beyond_what_enough_cameras_see(least: int) -
     assert (factors.diff() <= 0).all()
     assert factors.diff().abs().max() < 0.02  # of 400 places, 75 between the edges
     assert (fade_factors(places, cameras, 5) == 0).all()
+    assert (fade_factors(places, [], 1) == 0).all()
+    assert (fade_factors(places, cameras, 0) == 1).all()
 
 
 @pytest.mark.parametrize("model", ["pinhole", "orthographic"])

@@ -28,6 +28,8 @@ EPSILON = 1e-8
 FADE_BELOW = 2
 #: It has faded out where it lies so far beyond a picture's edge, as a share of the longer side (choice).
 FADE_MARGIN = 0.15
+#: Places that all cameras are asked about at once: with a thousand cameras 64 MB.
+PLACES_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -60,15 +62,11 @@ def fade_factors(
     factors = (count_visibility(positions, cameras) >= min_visibility).to(positions)
     edge = torch.nonzero(factors == 0)[:, 0]
     edge = edge[count_visibility(positions[edge], [_widened(each) for each in cameras]) >= min_visibility]
-    outside = [torch.full_like(factors[edge], math.inf) for _ in range(min_visibility)]  # ascending
-    places = positions[edge].T.contiguous()
-    for camera in cameras:
-        more = _share_outside(places, camera)
-        for k, least in enumerate(outside):
-            outside[k], more = torch.minimum(least, more), torch.maximum(least, more)
-    for last in outside[-1:]:
-        held = (1 - last / FADE_MARGIN).clamp(0, 1)
-        factors[edge] = held * held * (3 - 2 * held)
+    for some in edge.split(PLACES_AT_ONCE) if len(edge) else ():
+        places = positions[some].T.contiguous()
+        outside = torch.stack([_share_outside(places, camera) for camera in cameras], dim=1)
+        held = (1 - outside.kthvalue(min_visibility, dim=1).values / FADE_MARGIN).clamp(0, 1)
+        factors[some] = held * held * (3 - 2 * held)
     return factors
 
 
