@@ -181,3 +181,26 @@ def cloud_and_cameras(dtype: torch.dtype) -> tuple[torch.Tensor, list[Camera]]:
     cloud = torch.from_numpy(generator.uniform(-50.0, 50.0, (700, 3))).to(dtype)
     cloud[3, 1], cloud[4, 2] = torch.nan, torch.inf
     return cloud, cameras
+
+
+@every_instruction_set
+@pytest.mark.parametrize("model", ["pinhole", "orthographic"])
+@pytest.mark.parametrize(("n", "least"), [(1, 1), (700, 1), (3000, 2), (3000, 5)])
+def test_native_fades_as_the_reference_does(n: int, least: int, model: str, instructions: str) -> None:
+    """Also where no camera of a block is near, behind cameras, and for what is not finite."""
+    generator = np.random.default_rng(n + least)
+    cameras = [make_camera(generator, 20.0, model) for _ in range(40)]
+    points = torch.from_numpy(generator.uniform(-40, 40, (n, 3)))
+    points[n // 2 :: 100] = np.nan
+    with using(instructions):
+        for those in (points.float(), points):
+            wanted = reference.fade_factors(those, cameras, least, 0.3)
+            factors = native.fade_factors(those, cameras, least, 0.3)
+            with on_threads(1):
+                assert torch.equal(native.fade_factors(those, cameras, least, 0.3), factors)
+            torch.testing.assert_close(factors, wanted, atol=1e-4, rtol=0)
+            assert (factors[reference.count_visibility(those, cameras) >= least] == 1).all()
+            assert (factors[those.isnan().any(1)] == 0).all()
+            assert n < 3000 or ((factors > 0.02) & (factors < 0.98)).sum() > 100
+        assert (native.fade_factors(points, cameras[: least - 1], least, 0.3) == 0).all()
+        assert (native.fade_factors(points, cameras, 0, 0.3) == 1).all()

@@ -7,9 +7,8 @@ the cameras of a growth cycle).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,8 +27,6 @@ EPSILON = 1e-8
 FADE_BELOW = 2
 #: It has faded out where it lies so far beyond a picture's edge, as a share of the longer side (choice).
 FADE_MARGIN = 0.15
-#: Places that all cameras are asked about at once: with a thousand cameras 64 MB.
-PLACES_AT_ONCE = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -58,41 +55,8 @@ def fade_factors(
 ) -> Float[Tensor, " n"]:
     """What opacities are multiplied with where a scene fades out at its edge, by V of each place: 1 where at least
     `min_visibility` cameras hold it; farther out it falls smoothly to 0, by how much larger pictures would have to be
-    for so many to hold it."""
-    factors = (count_visibility(positions, cameras) >= min_visibility).to(positions)
-    edge = torch.nonzero(factors == 0)[:, 0]
-    edge = edge[count_visibility(positions[edge], [_widened(each) for each in cameras]) >= min_visibility]
-    for some in edge.split(PLACES_AT_ONCE) if len(edge) else ():
-        places = positions[some].T.contiguous()
-        outside = torch.stack([_share_outside(places, camera) for camera in cameras], dim=1)
-        held = (1 - outside.kthvalue(min_visibility, dim=1).values / FADE_MARGIN).clamp(0, 1)
-        factors[some] = held * held * (3 - 2 * held)
-    return factors
-
-
-def _widened(camera: Camera) -> Camera:
-    """A camera whose picture shows all on each side that has not faded out."""
-    more = math.ceil(FADE_MARGIN * max(camera.width, camera.height))
-    return replace(
-        camera, width=camera.width + 2 * more, height=camera.height + 2 * more, cx=camera.cx + more,
-        cy=camera.cy + more, uncropped_size=None,
-    )  # fmt: skip
-
-
-def _share_outside(places: Float[Tensor, "3 n"], camera: Camera) -> Float[Tensor, " n"]:
-    """How far places lie outside of a picture, in its longer sides; infinite behind the camera, 0 or less inside."""
-    longest, is_pinhole = max(camera.width, camera.height), camera.model == "pinhole"
-    fx, cx, half_width = camera.fx / longest, (camera.cx - camera.width / 2) / longest, camera.width / 2 / longest
-    fy, cy, half_height = camera.fy / longest, (camera.cy - camera.height / 2) / longest, camera.height / 2 / longest
-    lens = np.array([[fx, 0, cx * is_pinhole], [0, fy, cy * is_pinhole], [0, 0, 1]])  # from the picture's middle
-    pose = torch.from_numpy(lens @ camera.camera_from_world[:3]).to(places)
-    column, row, z = torch.addmm(pose[:, 3:], pose[:, :3], places)
-    if is_pinhole:
-        column, row = column.div_(z), row.div_(z)
-    else:
-        column, row = column.add_(cx), row.add_(cy)
-    outside = torch.maximum(column.abs_().sub_(half_width), row.abs_().sub_(half_height))
-    return torch.where(z > NEAR_PLANE, outside, math.inf)
+    for so many to hold it, as a share of `FADE_MARGIN`. Raises TypeError or ValueError as `count_visibility`."""
+    return get_backend(positions.device).fade_factors(positions, cameras, min_visibility, FADE_MARGIN)
 
 
 class NearbyCameras:

@@ -22,4 +22,5 @@ from vdgs.kernels.cpu.rasterize import rasterize_vjp as rasterize_vjp
 from vdgs.kernels.cpu.rasterize import splat_contributions as splat_contributions
 from vdgs.kernels.cpu.statistics import add_view_statistics as add_view_statistics
 from vdgs.kernels.cpu.visibility import count_visibility as count_visibility
+from vdgs.kernels.cpu.visibility import fade_factors as fade_factors
 from vdgs.kernels.cpu.visibility import mark_visible as mark_visible

@@ -19,6 +19,7 @@ from vdgs.kernels.torch_ref import adam_rows as adam_rows
 from vdgs.kernels.torch_ref import cell_centers as cell_centers
 from vdgs.kernels.torch_ref import cell_keys as cell_keys
 from vdgs.kernels.torch_ref import contains as contains
+from vdgs.kernels.torch_ref import fade_factors as fade_factors
 from vdgs.kernels.torch_ref import fit_harmonics as fit_harmonics
 from vdgs.kernels.torch_ref import group_cells as group_cells
 from vdgs.kernels.torch_ref import group_max as group_max

@@ -22,4 +22,5 @@ from vdgs.kernels.torch_ref.rasterize import rasterize_vjp as rasterize_vjp
 from vdgs.kernels.torch_ref.rasterize import splat_contributions as splat_contributions
 from vdgs.kernels.torch_ref.statistics import add_view_statistics as add_view_statistics
 from vdgs.kernels.torch_ref.visibility import count_visibility as count_visibility
+from vdgs.kernels.torch_ref.visibility import fade_factors as fade_factors
 from vdgs.kernels.torch_ref.visibility import mark_visible as mark_visible

@@ -6,14 +6,20 @@ is hidden behind anything else.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.transfer import to_like
+
+#: Places that all cameras are asked about at once: with a thousand cameras 64 MB.
+PLACES_AT_ONCE = 1 << 14
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
@@ -40,6 +46,51 @@ def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "
     column, row = camera.fx * x / divisor + camera.cx, camera.fy * y / divisor + camera.cy
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return finite & (z > NEAR_PLANE) & inside
+
+
+def fade_factors(
+    points: Float[Tensor, "n 3"], cameras: Sequence[Camera], least: int, margin: float
+) -> Float[Tensor, " n"]:
+    """h²(3 - 2h) of each point with h = 1 - s / margin, within [0, 1]: s is the least-th smallest share of their longer
+    side by which pictures would have to be larger on each side to show it (0: they do), infinite behind a camera.
+
+    Float32. All are 1 where `least` is 0; 0 where there are fewer cameras, and for a point that is not finite. Raises
+    TypeError or ValueError as `count_visibility`.
+    """
+    factors = (count_visibility(points, cameras) >= least).float()
+    edge = torch.nonzero(factors == 0)[:, 0]
+    edge = edge[count_visibility(points[edge], [_widened(each, margin) for each in cameras]) >= least]
+    for some in edge.split(PLACES_AT_ONCE) if len(edge) else ():
+        places = points[some].T.contiguous()
+        outside = torch.stack([_share_outside(places, camera) for camera in cameras], dim=1)
+        held = (1 - outside.kthvalue(least, dim=1).values / margin).clamp(0, 1)
+        factors[some] = (held * held * (3 - 2 * held)).float()
+    return factors
+
+
+def _widened(camera: Camera, margin: float) -> Camera:
+    """A camera whose picture shows all on each side that has not faded out."""
+    more = math.ceil(margin * max(camera.width, camera.height))
+    return replace(
+        camera, width=camera.width + 2 * more, height=camera.height + 2 * more, cx=camera.cx + more,
+        cy=camera.cy + more, uncropped_size=None,
+    )  # fmt: skip
+
+
+def _share_outside(places: Float[Tensor, "3 n"], camera: Camera) -> Float[Tensor, " n"]:
+    """How far places lie outside of a picture, in its longer sides; infinite behind the camera, 0 or less inside."""
+    longest, is_pinhole = max(camera.width, camera.height), camera.model == "pinhole"
+    fx, cx, half_width = camera.fx / longest, (camera.cx - camera.width / 2) / longest, camera.width / 2 / longest
+    fy, cy, half_height = camera.fy / longest, (camera.cy - camera.height / 2) / longest, camera.height / 2 / longest
+    lens = np.array([[fx, 0, cx * is_pinhole], [0, fy, cy * is_pinhole], [0, 0, 1]])  # from the picture's middle
+    pose = torch.from_numpy(lens @ camera.camera_from_world[:3]).to(places)
+    column, row, z = torch.addmm(pose[:, 3:], pose[:, :3], places)
+    if is_pinhole:
+        column, row = column.div_(z), row.div_(z)
+    else:
+        column, row = column.add_(cx), row.add_(cy)
+    outside = torch.maximum(column.abs_().sub_(half_width), row.abs_().sub_(half_height))
+    return torch.where(z > NEAR_PLANE, outside, math.inf)
 
 
 def check_points(points: Tensor) -> None:

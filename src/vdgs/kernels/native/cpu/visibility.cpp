@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "bindings.h"
+#include "cpu/view_camera.h"
 #include "simd/simd.h"
 #include "threads.h"
 
@@ -30,12 +31,6 @@ constexpr double kRounding = 16.0 / (1 << 24);
 constexpr double kExactRounding = 16.0 / (int64_t{1} << 53);
 // Blocks that reach further than this could overflow in float32; they are computed in float64 throughout.
 constexpr float kFar = 1e30f;
-
-// In float64, packed in this order by views.py; the rotation is row-major.
-struct ViewCamera {
-  double rotation[9], translation[3], fx, fy, cx, cy, width, height, orthographic, near;
-};
-constexpr size_t kCameraNumbers = sizeof(ViewCamera) / sizeof(double);
 
 struct Plane {
   double normal[3], offset;
