@@ -1,8 +1,9 @@
-"""Counting views (V_i) of a drone flight: the native kernel beside brute force, in one run.
+"""Counting views (V_i) of a drone flight and fading its edge: the native kernels beside their torch twins, in one run.
 
     OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.visibility [--points 1000000] [--cameras 1000]
 
-Brute force runs on the first few cameras only and is scaled up; both counts of those are compared.
+Brute force runs on the first few cameras only and is scaled up; both counts of those are compared. The edge fades by
+those few cameras, where fewer than two see, with both.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu import visibility as native
 from vdgs.kernels.torch_ref import visibility as reference
+from vdgs.visibility.visibility_counts import FADE_BELOW, FADE_MARGIN
 
 BRUTE_FORCE_CAMERAS = 10
 #: Name, side of the square in metres, tilt of the cameras in degrees.
@@ -48,6 +51,13 @@ def scene(n: int, extent_m: float) -> torch.Tensor:
     return torch.from_numpy(generator.uniform([0, 0, 0], [extent_m, extent_m, 60], (n, 3))).float()
 
 
+def timed(call: Callable[[], torch.Tensor]) -> tuple[float, torch.Tensor]:
+    """Seconds that a call takes, and what it gives."""
+    start = time.perf_counter()
+    result = call()
+    return time.perf_counter() - start, result
+
+
 def main() -> None:
     """Print one line for each kind of flight."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -59,19 +69,22 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.points} points x {arguments.cameras} cameras")
-    print(f"{'flight':>22} {'native s':>9} {'brute force s (scaled)':>23} {'mean V':>7} {'differing':>9}")
+    print(f"{'flight':>22} {'native s':>9} {'brute force s (scaled)':>23} {'mean V':>7} {'differing':>9}"
+          f" {'fade ms':>8} {'torch ms':>9} {'largest difference':>18}")  # fmt: skip
     for name, extent_m, tilt_deg in FLIGHTS:
         points = scene(arguments.points, extent_m)
         cameras = flight(arguments.cameras, extent_m, 120.0, tilt_deg)
-        start = time.perf_counter()
-        count = native.count_visibility(points, cameras)
-        seconds = time.perf_counter() - start
+        seconds, count = timed(lambda: native.count_visibility(points, cameras))
         few = cameras[:BRUTE_FORCE_CAMERAS]
-        start = time.perf_counter()
-        expected = reference.count_visibility(points, few)
-        brute_force = (time.perf_counter() - start) * len(cameras) / len(few)
+        brute_force, expected = timed(lambda: reference.count_visibility(points, few))
+        brute_force *= len(cameras) / len(few)
         differing = int((native.count_visibility(points, few) != expected).sum())
-        print(f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}")
+        fade_seconds, factors = timed(lambda: native.fade_factors(points, few, FADE_BELOW, FADE_MARGIN))
+        torch_seconds, wanted = timed(lambda: reference.fade_factors(points, few, FADE_BELOW, FADE_MARGIN))
+        print(
+            f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}"
+            f" {1e3 * fade_seconds:8.1f} {1e3 * torch_seconds:9.1f} {float((factors - wanted).abs().max()):18.1e}"
+        )
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
 

@@ -16,7 +16,7 @@ from vdgs.captures.loading import load_capture, read_files
 from vdgs.cli.common import make_console
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
-from vdgs.config.method import block_train_config
+from vdgs.config.method import LossConfig, block_train_config
 from vdgs.config.presets import PRESETS
 from vdgs.errors import Interrupted
 from vdgs.pipeline import dry_run, image_size, run_estimate, time_estimate
@@ -70,7 +70,9 @@ def step_times(fixed: float, per_pixel: float, per_anchor: float = 0.0) -> StepT
 
 def test_steps_of_all_sizes_follow_from_those_of_one():
     """A stage of a schedule in sizes: 30 % of its steps at a quarter of the pixels, 70 % whole."""
-    config = replace(PRESETS["laptop"].training, iterations=1000, resolution_schedule=((0.0, 2), (0.3, 1)))
+    config = replace(
+        PRESETS["laptop"].training, iterations=1000, resolution_schedule=((0.0, 2), (0.3, 1)), loss=LossConfig()
+    )
     steps = step_times(0.01, 1e-7)
     assert steps.step(1_000_000, 0).processor_seconds == pytest.approx(0.11)
     taken = steps.stage(config, 1_000_000, 1e5, 1.0).processor_seconds
