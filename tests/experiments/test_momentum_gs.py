@@ -12,7 +12,7 @@ from experiments.baselines.turns import next_in_turn
 from support.block_training import BLOCKS, CONFIG, block_stage, coarse
 from support.checkerboard import Photographs
 from vdgs.config.method import BlockConfig, CompensationConfig
-from vdgs.model.decoder import Decoder
+from vdgs.model.decoder import EXPOSURE, Decoder
 from vdgs.model.renderer import cull_anchors
 from vdgs.training import initial_state, to_checkpoint, train
 
@@ -72,7 +72,7 @@ def test_in_the_last_round_the_others_take_the_decoder_as_it_is():
 def test_a_turn_moves_the_heads_and_nothing_that_all_blocks_share():
     decoder = replace(coarse()[1].copy(), exposure=torch.zeros(2, 3, 4), envmap=torch.zeros(4, 8, 3))
     set_trainable(decoder, replace(block_stage(BlockConfig(), 0, PLAIN)[0], frozen_decoder=False), True)
-    assert {name for name, tensor in decoder.tensors().items() if not tensor.requires_grad} == {"exposure", "envmap"}
+    assert {name for name, tensor in decoder.tensors().items() if not tensor.requires_grad} == {EXPOSURE, "envmap"}
 
 
 def test_consistency_pulls_the_student_to_its_teacher():

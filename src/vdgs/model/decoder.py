@@ -20,6 +20,8 @@ from vdgs.model.exposure import exposure_matrix
 
 HEADS = {"opacity": 1, "covariance": 7, "color": 3}  # outputs per offset
 HEAD_TENSORS = ("w1", "b1", "w2", "b2")
+#: The name of the departures of exposures among the tensors.
+EXPOSURE = "exposure_departures"
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Decoder:
     #: One row per training image, and its map to the color head's hidden layer; None without appearance.
     appearance_embedding: Float[Tensor, "images a"] | None = None
     appearance_weight: Float[Tensor, "32 a"] | None = None
-    #: Departures of each training image's colors from the mean (`model.exposure`); None: no exposure is fitted.
+    #: Departures of each training image's colors from neutral (`model.exposure`); None: no exposure is fitted.
     exposure: Float[Tensor, "images 3 4"] | None = None
     #: What is drawn behind all anchors (`model.envmap`); None: a plain color.
     envmap: Float[Tensor, "rows columns 3"] | None = None
@@ -56,7 +58,9 @@ class Decoder:
     def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
         """The inverse of `tensors`. Raises KeyError on a missing tensor."""
         weights = DecoderWeights(*(MlpWeights(*(tensors[f"{head}_{part}"] for part in HEAD_TENSORS)) for head in HEADS))
-        optional = (tensors.get(name) for name in ("appearance", "appearance_weight", "exposure", "envmap"))
+        optional = [tensors.get(name) for name in ("appearance", "appearance_weight", EXPOSURE, "envmap")]
+        if (around_mean := tensors.get("exposure")) is not None:  # of files from before 2026-11-27
+            optional[2] = around_mean - around_mean.mean(0)
         return Decoder(weights, *optional)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -64,7 +68,7 @@ class Decoder:
         if self.appearance_embedding is not None and self.appearance_weight is not None:
             named |= {"appearance": self.appearance_embedding, "appearance_weight": self.appearance_weight}
         if self.exposure is not None:
-            named["exposure"] = self.exposure
+            named[EXPOSURE] = self.exposure
         if self.envmap is not None:
             named["envmap"] = self.envmap
         return named

@@ -1,8 +1,9 @@
 """The exposure of each photograph: an affine model of its colors, trained with the scene.
 
-Photographs of one flight differ in brightness and white balance. A photograph's model is its departure from the mean of
-all, so that the mean is neutral, and the scene is drawn in neutral colors. Exposure drifts along a flight: that of a
-test photograph is interpolated from those taken just before and after it (`interpolate_exposure`).
+Photographs of one flight differ in brightness and white balance. A photograph's model is its departure from neutral
+colors, in which the scene is drawn: those nearest to all photographs (`training.exposure_centering`). Exposure drifts
+along a flight: that of a test photograph is interpolated from those taken just before and after it
+(`interpolate_exposure`).
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ def zero_exposures(images: int) -> Float[Tensor, "images 3 4"]:
 
 
 def exposure_matrix(departures: Float[Tensor, "images 3 4"], image: int) -> Float[Tensor, "3 4"]:
-    """The color model [A | b] of a photograph: c -> A c + b. Over all photographs their mean is [1 | 0]."""
-    return _neutral(departures) + departures[image] - departures.mean(0)
+    """The color model [A | b] of a photograph: c -> A c + b; [1 | 0] where it does not depart from neutral colors."""
+    return _neutral(departures) + departures[image]
 
 
 class FlightNeighbors(NamedTuple):

@@ -25,6 +25,7 @@ from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
 from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
 from vdgs.training.densification_step import densify, sort_morton
 from vdgs.training.depth_agreement import DepthAgreement, depth_agreement
+from vdgs.training.exposure_centering import center_exposures, count_exposure
 from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.pseudo_views import is_pseudo_view_due, pseudo_camera, warp_photograph
@@ -118,6 +119,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     psnr = training_psnr(compared.shown, target.image, target.mask) if measured else None
     state.is_consistent = False
     finite = _move(state, stage, rows, gradients, weights, camera)
+    _count_exposure(state, stage, view, target, drawn)
     if with_pseudo_view:
         finite = pseudo_step(state, stage, view, target, drawn.raster) & finite
 
@@ -133,6 +135,18 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     _smooth(state, value, psnr)
     state.is_consistent = True
     return report
+
+
+def _count_exposure(
+    state: TrainingState, stage: TrainingProblem, view: int, target: TrainingTarget, drawn: RenderedTrainingView
+) -> None:
+    """Count the exposure of a photograph, and after each pass over all of them move neutral colors to their middle."""
+    if (moments := state.exposure_moments) is None or (departures := state.decoder.exposure) is None:
+        return
+    departure = departures[image_index_at(stage, view)]
+    count_exposure(moments, departure, drawn.image, drawn.raster.alpha, target.mask)
+    if (state.iteration + 1) % stage.num_images == 0:
+        center_exposures(departures.detach(), moments)
 
 
 def _sort_bound_and_average(state: TrainingState, config: TrainConfig) -> None:

@@ -20,6 +20,7 @@ from vdgs.model.decoder import Decoder
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training.compensation import CompensationState
 from vdgs.training.crops import Crop
+from vdgs.training.exposure_centering import ExposureMoments, zero_moments
 from vdgs.training.optimizer import AdamMoments, AnchorOptimizer
 from vdgs.training.per_anchor_tensors import TensorGroup
 from vdgs.training.weight_averaging import ModelAverage
@@ -70,6 +71,8 @@ class TrainingState:
     compensation: CompensationState | None = None
     #: Mean of the last models, once it has begun (`is_averaged_step`).
     model_average: ModelAverage | None = None
+    #: Of the photographs of this pass; None where no exposure is trained.
+    exposure_moments: ExposureMoments | None = None
     #: Smoothed loss, its minimum, and smoothed PSNR of training views.
     loss: float = math.nan
     best_loss: float = math.inf
@@ -217,6 +220,7 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
         shared = stage.kind == "block" and name.startswith(SHARED_TENSORS)
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = CompensationState.zeros(n, k, device) if stage.config.compensation.enabled else None
+    exposed = decoder.exposure is not None and decoder.exposure.requires_grad
     return TrainingState(
         iteration=0,
         anchors=anchors,
@@ -225,6 +229,7 @@ def initial_state(anchors: Anchors, decoder: Decoder, stage: TrainingProblem) ->
         optimizer=AnchorOptimizer.zeros(anchors, decoder),
         max_log_scale=stage.max_log_scale_at(anchors.positions),
         compensation=compensation,
+        exposure_moments=zero_moments(device) if exposed else None,
     )
 
 
@@ -236,6 +241,8 @@ def to_checkpoint(state: TrainingState) -> Checkpoint:
     groups["second.decoder"] = state.optimizer.decoder.second
     if state.model_average is not None:
         groups["average.decoder"] = state.model_average.decoder
+    if state.exposure_moments is not None:
+        groups["exposure"] = {"moments": state.exposure_moments}
     tensors = {f"{name}.{key}": tensor for name, group in groups.items() for key, tensor in group.items()}
     metadata = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
              "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes,
@@ -269,6 +276,8 @@ def from_checkpoint(
     state.optimizer.decoder = AdamMoments(group("first.decoder"), group("second.decoder"))
     if averaged := saved.metadata["averaged"]:
         state.model_average = ModelAverage(averaged, group("average.anchors"), group("average.decoder"))
+    if state.exposure_moments is not None:
+        state.exposure_moments = group("exposure")["moments"]
     state.put_groups({name: group(name) for name in state.groups()})
     state.iteration = saved.iteration
     state.loss, state.best_loss = float(saved.metadata["loss"]), float(saved.metadata["best_loss"])

@@ -1,0 +1,71 @@
+"""Which colors are neutral: those that come nearest to all photographs where one exposure is to do for all of them.
+
+A scene in other colors, with exposures that undo the change, shows the same photographs: they leave open which colors
+the scene has, and training drifts. Of photograph i let x be (color, 1) of a pixel in neutral colors, D_i its departure
+([1 | 0] + D_i is its exposure) and S_i the mean of x xᵀ over its pixels. The map of colors that is nearest to all
+exposures, in the squares of the differences that it makes in the pixels, is [1 | 0] + M with
+
+    M = (Σ D_i S_i) (Σ S_i)⁻¹.
+
+After each pass over the photographs M is taken from all departures, and the colors of the scene follow. (The mean of the
+departures in place of M does not see that cameras expose bright places less, and how alike red, green and blue are.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vdgs.kernels.transfer import is_host
+
+#: Of each photograph the pixels of every fourth row and column are counted, where the scene is at least so opaque.
+PIXEL_STEP, MIN_ALPHA = 4, 0.5
+#: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open.
+RIDGE = 1e-7
+
+#: Σ D_i S_i above Σ S_i, float64.
+ExposureMoments = Float[Tensor, "7 4"]
+
+
+def zero_moments(device: torch.device) -> ExposureMoments:
+    """The sums before the first photograph."""
+    return torch.zeros(7, 4, dtype=torch.float64, device=device)
+
+
+@torch.no_grad()
+def count_exposure(
+    moments: ExposureMoments,
+    departure: Float[Tensor, "3 4"],
+    image: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    mask: UInt8[Tensor, "h w"] | None,
+) -> None:
+    """Add a photograph with the picture of the scene in neutral colors, in place; pixels that its mask leaves out do
+    not count."""
+    part = slice(None, None, PIXEL_STEP)
+    counted = alpha[part, part] >= MIN_ALPHA
+    if mask is not None:
+        counted = counted & (mask[part, part] > 0)
+    pixels = image.detach()[part, part].double()
+    colors = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2) * counted[..., None]
+    of_colors = _sum_of_products(colors.flatten(0, 1)) / counted.sum().clamp(min=1)
+    moments[:3] += departure.double() @ of_colors
+    moments[3:] += of_colors
+
+
+def _sum_of_products(colors: Float[Tensor, "p 4"]) -> Float[Tensor, "4 4"]:
+    """Σ x xᵀ. On a CPU with the same bits for any number of threads, which a product of torch does not promise."""
+    if not is_host(colors):
+        return colors.T @ colors
+    return torch.from_numpy(np.einsum("pi,pj->ij", colors.numpy(), colors.numpy()))
+
+
+@torch.no_grad()
+def center_exposures(departures: Float[Tensor, "images 3 4"], moments: ExposureMoments) -> None:
+    """Take M from all departures, in place, and set the sums back to 0. Nothing where no photograph was counted."""
+    of_colors = moments[3:] + RIDGE * moments[3:].trace() * torch.eye(4, dtype=moments.dtype, device=moments.device)
+    if float(moments[3:].trace()) > 0:
+        departures -= torch.linalg.solve(of_colors, moments[:3].T).T.to(departures)
+    moments.zero_()
