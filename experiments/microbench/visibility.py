@@ -51,10 +51,10 @@ def scene(n: int, extent_m: float) -> torch.Tensor:
     return torch.from_numpy(generator.uniform([0, 0, 0], [extent_m, extent_m, 60], (n, 3))).float()
 
 
-def timed(call: Callable[[], torch.Tensor]) -> tuple[float, torch.Tensor]:
+def timed(function: Callable[..., torch.Tensor], *arguments: object) -> tuple[float, torch.Tensor]:
     """Seconds that a call takes, and what it gives."""
     start = time.perf_counter()
-    result = call()
+    result = function(*arguments)
     return time.perf_counter() - start, result
 
 
@@ -74,13 +74,13 @@ def main() -> None:
     for name, extent_m, tilt_deg in FLIGHTS:
         points = scene(arguments.points, extent_m)
         cameras = flight(arguments.cameras, extent_m, 120.0, tilt_deg)
-        seconds, count = timed(lambda: native.count_visibility(points, cameras))
+        seconds, count = timed(native.count_visibility, points, cameras)
         few = cameras[:BRUTE_FORCE_CAMERAS]
-        brute_force, expected = timed(lambda: reference.count_visibility(points, few))
+        brute_force, expected = timed(reference.count_visibility, points, few)
         brute_force *= len(cameras) / len(few)
         differing = int((native.count_visibility(points, few) != expected).sum())
-        fade_seconds, factors = timed(lambda: native.fade_factors(points, few, FADE_BELOW, FADE_MARGIN))
-        torch_seconds, wanted = timed(lambda: reference.fade_factors(points, few, FADE_BELOW, FADE_MARGIN))
+        fade_seconds, factors = timed(native.fade_factors, points, few, FADE_BELOW, FADE_MARGIN)
+        torch_seconds, wanted = timed(reference.fade_factors, points, few, FADE_BELOW, FADE_MARGIN)
         print(
             f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}"
             f" {1e3 * fade_seconds:8.1f} {1e3 * torch_seconds:9.1f} {float((factors - wanted).abs().max()):18.1e}"

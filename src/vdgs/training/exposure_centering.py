@@ -2,13 +2,13 @@
 
 A scene in other colors, with exposures that undo the change, shows the same photographs: they leave open which colors
 the scene has, and training drifts. Of photograph i let x be (color, 1) of a pixel in neutral colors, D_i its departure
-([1 | 0] + D_i is its exposure) and S_i the mean of x xᵀ over its pixels. The map of colors that is nearest to all
-exposures, in the squares of the differences that it makes in the pixels, is [1 | 0] + M with
+([1 | 0] + D_i is its exposure) and S_i the mean of x xᵀ over its pixels. Of all maps of colors, [1 | 0] + M with
 
-    M = (Σ D_i S_i) (Σ S_i)⁻¹.
+    M = (Σ D_i S_i) (Σ S_i)⁻¹
 
-After each pass over the photographs M is taken from all departures, and the colors of the scene follow. (The mean of the
-departures in place of M does not see that cameras expose bright places less, and how alike red, green and blue are.)
+is nearest to all exposures, by the squares of the differences in their pixels. After each pass over the photographs M
+is taken from all departures, and the colors of the scene follow. (The mean of the departures in place of M does not
+see that cameras expose bright places less, nor how alike red, green and blue are.)
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
 def fade_factors(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], least: int, margin: float
 ) -> Float[Tensor, " n"]:
-    """As `torch_ref.fade_factors`, to 5e-5, and 1 wherever `least` cameras hold a point. Same bits for any number of threads. O(n) memory; a block of 512 neighbors
-    that a camera does not reach costs one test."""
+    """As `torch_ref.fade_factors`, to 5e-5, and 1 wherever `least` cameras hold a point. Same bits for any number of
+    threads. O(n) memory; a block of 512 neighbors that a camera does not reach costs one test."""
     check_points(points)
     if least <= 0 or len(cameras) < least:
         return torch.full(points.shape[:1], float(least <= 0))
