@@ -2,7 +2,7 @@
 
     python -m experiments.reports.analyses.exposures DATA/copr --images images_4
 
-What `--exposure-spread` decides by: nothing is trained. Needs a capture with tracks, and photographs in one folder.
+What `--exposure-min-spread` decides by: nothing is trained. Needs a capture with tracks, and photographs in one folder.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 
 import numpy as np
-from experiments.microbench.machine import describe
 
-from vdgs.captures.brightness import point_colours
-from vdgs.captures.images import ImageCache
+from experiments.microbench.hardware_info import describe
+from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.loading import load_capture
-from vdgs.settings.capture import CaptureOptions
+from vdgs.captures.photometric_gains import collect_point_colors
+from vdgs.config.capture_options import CaptureOptions
 
 
 def main() -> None:
@@ -28,16 +28,16 @@ def main() -> None:
     views = load_capture(asked.capture, CaptureOptions(images=asked.images)).train_views
     began = time.monotonic()
     with ImageCache(views, 0) as images:
-        colours = point_colours(images, lambda _done, _of: None)
-    if colours is None:
+        colors = collect_point_colors(images, lambda _done, _of: None)
+    if colors is None:
         raise SystemExit(f"{asked.capture}: does not say which photographs show the same points")
     gains = np.full((len(views), 3), np.nan)
-    for index, gain in colours.gains().items():
+    for index, gain in colors.gains().items():
         gains[index] = gain
     foretold = (gains[:-2] + gains[2:]) / 2
     print(describe())
     print(
-        f"{len(gains)} training photographs: of the same places differ by {colours.difference():.2%}, all by "
+        f"{len(gains)} training photographs: of the same places differ by {colors.gain_spread():.2%}, all by "
         f"{words(gains)} (red, green, blue), from the mean of their neighbours by {words(gains[1:-1] - foretold)}; "
         f"{time.monotonic() - began:.1f} s"
     )

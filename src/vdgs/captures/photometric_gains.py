@@ -97,7 +97,7 @@ def collect_point_colors(
     every capture says which photograph shows which point.
 
     At most `most_images` photographs, spread over all, are looked at.
-    `tell(done, of)` is called before each photograph is looked at, and may raise. Raises what reading them does.
+    `on_progress(done, of)` is called before each photograph is looked at, and may raise. Raises what reading them does.
     """
     chosen = np.unique(np.linspace(0, len(images.views) - 1, min(len(images.views), most_images)).astype(int)).tolist()
     shows = [index for index in chosen if images.views[index].observations is not None]
