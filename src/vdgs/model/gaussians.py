@@ -52,6 +52,10 @@ class Gaussians:
         """The Gaussians of the given rows (indices or mask)."""
         return replace(self, **{name: tensor[rows] for name, tensor in self.tensors().items()})
 
+    def float(self: AnyGaussians) -> AnyGaussians:
+        """The same numbers in float32."""
+        return replace(self, **{name: tensor.float() for name, tensor in self.tensors().items()})
+
     def to(self: AnyGaussians, device: torch.device | str) -> AnyGaussians:
         """The same Gaussians on a device; the same tensors where they are on it."""
         return replace(self, **{name: tensor.to(device) for name, tensor in self.tensors().items()})

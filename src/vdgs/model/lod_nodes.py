@@ -107,8 +107,9 @@ def save_node(path: Path, gaussians: NodeGaussians, record: NodeRecord) -> None:
 
 
 def load_node(path: Path) -> NodeGaussians:
-    """The merged Gaussians of a node, in float32. Raises VdgsError for a damaged file."""
-    return NodeGaussians(**{name: tensor.float() for name, tensor in _read(path, NodeGaussians).items()})
+    """The merged Gaussians of a node as they were saved, places alone in full precision. Raises VdgsError for a damaged
+    file."""
+    return NodeGaussians(**_read(path, NodeGaussians))
 
 
 def save_anchors(path: Path, anchors: Anchors, rows: Int[np.ndarray, " r"]) -> None:

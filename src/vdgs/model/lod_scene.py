@@ -123,10 +123,13 @@ class LodScene:
         if cut.leaves:
             found.append(self._leaf_values(cut.leaves, camera, of))
         if cut.nodes:
-            values = torch.cat([of(("nodes", node), self.tree.gaussians(node).means) for node in cut.nodes])
-            factors = self._node_factors(cut.nodes)
-            found.append(values if factors is None else values[factors > 0])
+            found += [self._node_values(node, of) for node in cut.nodes]
         return torch.cat(found) if found else torch.zeros(0)
+
+    def _node_values(self, node: int, of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
+        """Values of the merged Gaussians of a node that are drawn."""
+        values, factors = of(("nodes", node), self.tree.gaussians(node).means), self._node_factors(node)
+        return values if factors is None else values[factors > 0]
 
     def _leaf_values(
         self, leaves: tuple[int, ...], camera: Camera, of: Callable[[NodeContent, Tensor], Tensor]
@@ -155,14 +158,9 @@ class LodScene:
             mask = seen if mask is None else mask & seen
         return mask
 
-    def _node_factors(self, nodes: tuple[int, ...]) -> Float[Tensor, " m"] | None:
-        """What the opacities of the merged Gaussians of some nodes are multiplied with; None: nothing."""
-
-        def means(node: int) -> Tensor:
-            return self.tree.gaussians(node).means
-
-        found = [self._content_factors(("nodes", node), partial(means, node)) for node in nodes]
-        return None if self.fade is None else torch.cat([each for each in found if each is not None])
+    def _node_factors(self, node: int) -> Float[Tensor, " m"] | None:
+        """What the opacities of the merged Gaussians of a node are multiplied with; None: nothing."""
+        return self._content_factors(("nodes", node), lambda: self.tree.gaussians(node).means)
 
     def _content_factors(self, content: NodeContent, places: Callable[[], Tensor]) -> Float[Tensor, " p"] | None:
         """`fade` of the places of a node; what was asked for lately is kept."""
@@ -200,14 +198,17 @@ class LodScene:
 
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
-        found = self.tree.gaussians_of(nodes)
-        if found is not None and (factors := self._node_factors(nodes)) is not None:
-            drawn = factors > 0
-            found = found.select(drawn)
-            opacities = found.opacity_logits.sigmoid() * factors[drawn].to(found.opacity_logits)
-            whole = factors[drawn] == 1
-            found = replace(found, opacity_logits=torch.where(whole, found.opacity_logits, opacities.logit()))
+        found = self.tree.gaussians_of(nodes, self._drawn_gaussians)
         return None if found is None else found.to(self.device)
+
+    def _drawn_gaussians(self, node: int) -> NodeGaussians:
+        """The merged Gaussians of a node that are drawn, faded."""
+        gaussians, factors = self.tree.gaussians(node), self._node_factors(node)
+        if factors is None or not len(faded := (factors < 1).nonzero()[:, 0]):
+            return gaussians
+        logits = gaussians.opacity_logits.clone()
+        logits[faded] = (logits[faded].float().sigmoid() * factors[faded]).logit().to(logits)
+        return replace(gaussians, opacity_logits=logits).select(factors > 0)
 
 
 _Held = TypeVar("_Held")

@@ -28,7 +28,7 @@ from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_nodes import TREE_FILE, LodTable, anchors_file, load_anchors, load_node, node_file
 
 #: Nodes are kept in memory up to so many bytes.
-CACHE_BYTES = 384 << 20
+CACHE_BYTES = 256 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.
@@ -151,7 +151,7 @@ class LodTree:
         return other
 
     def gaussians(self, node: int) -> NodeGaussians:
-        """The merged Gaussians of a node."""
+        """The merged Gaussians of a node as its file has them: places in full, all else in half precision."""
         return self._cache.get(("nodes", node), lambda: load_node(node_file(self.folder, node)), _bytes)
 
     def anchors(self, leaf: int) -> tuple[Anchors, Tensor]:
@@ -160,10 +160,10 @@ class LodTree:
             ("anchors", leaf), lambda: load_anchors(anchors_file(self.folder, leaf)), lambda content: _bytes(content[0])
         )
 
-    def gaussians_of(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
-        """The merged Gaussians of some nodes, one after another."""
-        parts = [self.gaussians(node) for node in nodes]
-        return _joined(NodeGaussians, parts) if parts else None
+    def gaussians_of(self, nodes: tuple[int, ...], drawn: Callable[[int], NodeGaussians]) -> NodeGaussians | None:
+        """The merged Gaussians of some nodes in float32, one after another; of each node those of `drawn`."""
+        parts = [drawn(node) for node in nodes]
+        return _joined(NodeGaussians, parts).float() if parts else None
 
     def anchors_of(
         self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]

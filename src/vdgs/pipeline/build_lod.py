@@ -192,7 +192,7 @@ class _Builder:
             return record
         below = self._children[node]
         records = [self._records[child] for child in below]
-        children = [load_node(node_file(self._folder, child)) for child in below]
+        children = [load_node(node_file(self._folder, child)).float() for child in below]
         gaussians, error = parent_gaussians(children, records, float(self._tree.edge[node]))
         record = node_record(gaussians, error, None, records)
         save_node(file, gaussians, record)
