@@ -81,6 +81,7 @@ def test_a_run_with_a_tree_is_drawn_through_it(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(build_lod, "MAX_LEAF_ANCHORS", 200)
     build_lod.build_tree(tmp_path, model, "1-a", CameraTable([view.camera for view in scene.capture.train_views], 4.0))
     tree = LodScene(LodTree(tmp_path), model.without_anchors())
+    assert scene.tree("merged") is None  # and stays so, whichever tests came before
     monkeypatch.setattr(viewer_scene, "find_tree", lambda run: tree if run.name == "merged" else None)
     seen = ViewerScene(scene.run, scene._open)
     seen.__dict__["blocks"] = quadrants()
