@@ -116,8 +116,9 @@ _ABLATIONS = [
         as_in_paper,
         citation="VDGS, sections IV-B and IV-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, the coarse stage's rates again, full "
-        "size, no mean of models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as "
-        "`full_method`; where the paper is silent, the choices of the preset `default`",
+        "size, no mean of models, whole photographs, share of 0.45, its compensation; no pseudo views and no loss of "
+        "depths; growth, and coarse stage and cut else, as `full_method`; where the paper is silent, the choices of "
+        "the preset `default`",
     ),
     BenchMethod("whole-photographs", "VDGS (full), whole photographs", with_full_images(full_method)),
     BenchMethod("no-blocking", "w/o blocking", without_blocking, citation="VDGS, Table II (b)"),
@@ -188,7 +189,7 @@ _LONGER = [
 ]  # fmt: skip
 _CHOICES = [
     BenchMethod("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
-    BenchMethod("even-sampling", "photographs used alike", with_block(view_sampling="uniform")),
+    BenchMethod("even-sampling", "photographs used alike, but for obliques", with_block(view_sampling="uniform")),
     BenchMethod("by-votes", "photographs by votes", with_block(view_sampling="visibility")),
     BenchMethod("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
     BenchMethod(

@@ -67,10 +67,11 @@ def disable_compensation(change: ConfigOverride) -> ConfigOverride:
 def as_in_paper(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
     and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
-    compensation. Where it is silent, as the preset `default`."""
+    compensation. Where it is silent, as the preset `default`. In both stages no pseudo views and no loss of depths."""
     plain, scene = MethodConfig(), config.block
     return replace(
         config,
+        training=replace(config.training, loss=plain.training.loss, oblique_sampling=plain.training.oblique_sampling),
         assignment=replace(config.assignment, threshold=plain.assignment.threshold),
         block=replace(
             plain.block,

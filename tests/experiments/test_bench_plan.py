@@ -152,7 +152,8 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     # But for what belongs to the scene.
     block = replace(default.block, iterations=base.block.iterations, densify=base.block.densify)
     assert printed.block == block
-    assert printed.training == base.training
+    alike = {"loss": default.training.loss, "oblique_sampling": 1.0}
+    assert printed.training == replace(base.training, **alike) != base.training
     alone = {
         name: METHODS[name].settings(base, scene.budget)
         for name in (
@@ -225,8 +226,9 @@ def test_runs_with_the_same_settings_are_one_run():
 
 def test_the_coarse_row_trains_nothing_of_its_own():
     plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=1))
-    (shared,) = plan.coarse
-    assert plan.run_of["tiny", "coarse", 0].coarse_from == shared.folder
+    shared, of_printed = sorted(plan.coarse, key=lambda run: run.folder != plan.run_of["tiny", "coarse", 0].coarse_from)
+    assert plan.run_of["tiny", "full", 0].coarse_from == shared.folder
+    assert plan.run_of["tiny", "printed", 0].coarse_from == of_printed.folder
     assert plan.run_of["tiny", "coarse-as-long", 0].coarse_from is None
     assert plan.run_of["tiny", "baseline", 0].coarse_from is None
     # Whatever stands beside it: a table with blocks, later in the same folder, finds what blocks begin with.

@@ -185,22 +185,36 @@ def cloud_and_cameras(dtype: torch.dtype) -> tuple[torch.Tensor, list[Camera]]:
 
 @every_instruction_set
 @pytest.mark.parametrize("model", ["pinhole", "orthographic"])
-@pytest.mark.parametrize(("n", "least"), [(1, 1), (700, 1), (3000, 2), (3000, 5)])
+@pytest.mark.parametrize(("n", "least"), [(0, 1), (1, 1), (700, 1), (3000, 2), (3000, 5)])
 def test_native_fades_as_the_reference_does(n: int, least: int, model: str, instructions: str) -> None:
-    """Also where no camera of a block is near, behind cameras, and for what is not finite."""
+    """Also near cameras and behind them, beside places that lie very far away, and for what is no place."""
     generator = np.random.default_rng(n + least)
     cameras = [make_camera(generator, 20.0, model) for _ in range(40)]
     points = torch.from_numpy(generator.uniform(-40, 40, (n, 3)))
+    points[100:200] = torch.from_numpy(cameras[0].position) + points[100:200] / 400
     points[n // 2 :: 100] = np.nan
+    points[-1:] = torch.inf
+    points[600:700:10] *= torch.logspace(2, 30, 10, dtype=torch.float64)[: len(points[600:700:10]), None]
     with using(instructions):
         for those in (points.float(), points):
-            wanted = reference.fade_factors(those, cameras, least, 0.3)
+            wanted = reference.fade_factors(those.double(), cameras, least, 0.3)
             factors = native.fade_factors(those, cameras, least, 0.3)
             with on_threads(1):
                 assert torch.equal(native.fade_factors(those, cameras, least, 0.3), factors)
-            torch.testing.assert_close(factors, wanted, atol=1e-4, rtol=0)
+            torch.testing.assert_close(factors, wanted, atol=5e-5, rtol=0)
             assert (factors[reference.count_visibility(those, cameras) >= least] == 1).all()
-            assert (factors[those.isnan().any(1)] == 0).all()
+            assert (factors[~those.isfinite().all(1)] == 0).all()
             assert n < 3000 or ((factors > 0.02) & (factors < 0.98)).sum() > 100
         assert (native.fade_factors(points, cameras[: least - 1], least, 0.3) == 0).all()
         assert (native.fade_factors(points, cameras, 0, 0.3) == 1).all()
+
+
+def test_one_place_far_away_fades_none_of_its_neighbors() -> None:
+    cameras = flight(30)
+    points = torch.from_numpy(np.random.default_rng(0).uniform(0, 1000, (500, 3)) * [1, 1, 0.05])
+    seen = reference.count_visibility(points, cameras) >= 2
+    for far in (1e5, 1e8, 1e12, 1e300):
+        points[250] = far
+        factors = native.fade_factors(points, cameras, 2, 0.15)
+        assert (factors[seen & (torch.arange(500) != 250)] == 1).all()
+        torch.testing.assert_close(factors, reference.fade_factors(points, cameras, 2, 0.15), atol=5e-5, rtol=0)

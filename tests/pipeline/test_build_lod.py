@@ -174,8 +174,16 @@ def test_levels_show_the_sky_with_aliasing_and_without(scene):
         assert (render(shown, up).image - 0.53).abs().max() < 1e-6
 
 
+def test_nodes_are_kept_as_they_were_saved_and_drawn_in_float32(scene):
+    kept = scene.tree.gaussians(0)
+    assert {name for name, tensor in kept.tensors().items() if tensor.dtype == torch.float32} == {"means"}
+    drawn = scene.at_error(1e6)._assemble_gaussians((0,))
+    for name, tensor in kept.tensors().items():
+        assert torch.equal(drawn.tensors()[name], tensor.float())
+
+
 def test_merging_cells_keeps_what_it_merges(scene):
-    gaussians = scene.tree.gaussians(0)
+    gaussians = scene.tree.gaussians(0).float()
     merged, error = merge_cells(gaussians, 1.5, np.zeros(len(gaussians)))
     assert 1 < len(merged) < len(gaussians)
     assert 0 < error < 1.5

@@ -1,4 +1,4 @@
-"""The exposure of photographs: neutral on average, fitted in training, left out of what is drawn, and known of test
+"""The exposure of photographs: about neutral colors, fitted in training, left out of what is drawn, and known of test
 photographs from those before and after them."""
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import MAX_FLIGHT_GAP, apply_exposure, exposure_matrix, interpolate_exposure, zero_exposures
 from vdgs.model.renderer import render
 from vdgs.training import TrainingProblem, from_checkpoint, initial_state, to_checkpoint, train_step
-from vdgs.training.exposure_centering import PIXEL_STEP, center_exposures, count_exposure, zero_moments
+from vdgs.training.exposure_centering import center_exposures, count_exposure, zero_moments
 
 pytestmark = [pytest.mark.xdist_group("training"), pytest.mark.slow]
 
@@ -65,8 +65,7 @@ def test_no_map_of_neutral_colors_is_nearer_to_all_photographs(seed, images, mas
     center_exposures(departures, moments)
     assert (moments == 0).all()
     counted = (alpha >= 0.5) & (torch.ones(24, 36) if mask is None else mask).bool()
-    part = slice(None, None, PIXEL_STEP)
-    pixels = pictures[:, part, part][:, counted[part, part]].double()
+    pixels = pictures[:, counted].double()  # so small pictures are counted whole
     shown = torch.stack([apply_exposure(p[None], exposure_matrix(departures, i))[0] for i, p in enumerate(pixels)])
     colors = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2).flatten(0, 1)
     best = torch.linalg.lstsq(colors, shown.flatten(0, 1)).solution.T
@@ -337,8 +336,28 @@ def test_photographs_of_unequal_brightness_are_told_from_the_scene():
     assert error(state) < error(plain)
 
 
+def test_exposures_are_centered_after_each_pass_but_the_last_step():
+    config = replace(CONFIG, iterations=24)
+    state, unequal = fitted(config)
+    counted = []
+    for _ in range(24):
+        train_step(state, unequal)
+        counted.append(float(state.exposure_moments[3:].trace()))
+    assert counted[7] == counted[15] == 0 < min(counted[14], counted[23])
+
+
+def test_a_state_with_exposures_of_an_older_version_is_refused():
+    state, unequal = fitted(replace(CONFIG, iterations=30))
+    saved = to_checkpoint(run(state, unequal, until=9))
+    older = {name.replace("exposure_departures", "exposure"): tensor for name, tensor in saved.tensors.items()}
+    assert len(older) == len(saved.tensors)
+    with pytest.raises(KeyError, match="exposure_departures"):
+        from_checkpoint(replace(saved, tensors=older), unequal)
+
+
 def test_blocks_take_exposures_as_they_are():
     state, block = fitted(kind="block")
+    assert state.exposure_moments is None
     with torch.no_grad():
         state.decoder.exposure.copy_(torch.linspace(-0.1, 0.1, 96).reshape(8, 3, 4))
     before = state.decoder.exposure.clone()

@@ -3,7 +3,8 @@
     python -m experiments.reports.analyses.neutral_colors RUN [--every 3]
 
 RUN was trained with --exposure-compensation. One map of colors is fitted to neutral renders of every so many training
-photographs, at half of their size, by least squares over their pixels. If the colors are neutral, the map gains nothing.
+photographs, at half of their size, by least squares over the pixels where the scene is opaque and no mask leaves them
+out. If the colors are neutral, the map gains nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from vdgs.captures.image_cache import ImageCache
 from vdgs.model.renderer import Drawable, render
 from vdgs.runs.open_run import open_run
 
-DOWNSCALE = 2
+DOWNSCALE, MIN_ALPHA = 2, 0.5
 #: Colors of the pixels of a render with a one beside them, and of the photograph.
 Pixels = tuple[Float[np.ndarray, "p 4"], Float[np.ndarray, "p 3"]]
 
@@ -47,9 +48,11 @@ def draw(model: Drawable, views: Sequence[View]) -> list[Pixels]:
     found = []
     with ImageCache(views, 0, downscales=(DOWNSCALE,)) as images:
         for index in range(len(views)):
-            image = render(model, images.camera(index, DOWNSCALE)).image.numpy().reshape(-1, 3)
-            photograph = images.get(index, DOWNSCALE).image.numpy().reshape(-1, 3) / 255.0
-            found.append((np.c_[image, np.ones(len(image))], photograph))
+            raster, photograph = render(model, images.camera(index, DOWNSCALE)), images.get(index, DOWNSCALE)
+            counted = raster.alpha >= MIN_ALPHA
+            counted &= True if photograph.mask is None else photograph.mask > 0
+            colors = raster.image[counted].numpy()
+            found.append((np.c_[colors, np.ones(len(colors))], photograph.image[counted].numpy() / 255.0))
     return found
 
 

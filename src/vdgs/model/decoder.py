@@ -20,8 +20,9 @@ from vdgs.model.exposure import exposure_matrix
 
 HEADS = {"opacity": 1, "covariance": 7, "color": 3}  # outputs per offset
 HEAD_TENSORS = ("w1", "b1", "w2", "b2")
-#: The name of the departures of exposures among the tensors.
-EXPOSURE = "exposure_departures"
+#: The name of the departures of exposures among the tensors, and that of files from before 2026-11-27, in which neutral
+#: is their mean.
+EXPOSURE, OLD_EXPOSURE = "exposure_departures", "exposure"
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,9 @@ class Decoder:
     def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
         """The inverse of `tensors`. Raises KeyError on a missing tensor."""
         weights = DecoderWeights(*(MlpWeights(*(tensors[f"{head}_{part}"] for part in HEAD_TENSORS)) for head in HEADS))
-        optional = [tensors.get(name) for name in ("appearance", "appearance_weight", EXPOSURE, "envmap")]
-        if (around_mean := tensors.get("exposure")) is not None:  # of files from before 2026-11-27
-            optional[2] = around_mean - around_mean.mean(0)
+        if (around_mean := tensors.get(OLD_EXPOSURE)) is not None:
+            tensors = {**tensors, EXPOSURE: around_mean - around_mean.mean(0)}
+        optional = (tensors.get(name) for name in ("appearance", "appearance_weight", EXPOSURE, "envmap"))
         return Decoder(weights, *optional)
 
     def tensors(self) -> dict[str, Tensor]:

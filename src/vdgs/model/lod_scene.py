@@ -199,7 +199,7 @@ class LodScene:
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
         found = self.tree.gaussians_of(nodes, self._drawn_gaussians)
-        return None if found is None else found.to(self.device)
+        return None if found is None else found.to(self.device).float()
 
     def _drawn_gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node that are drawn, faded."""

@@ -161,9 +161,9 @@ class LodTree:
         )
 
     def gaussians_of(self, nodes: tuple[int, ...], drawn: Callable[[int], NodeGaussians]) -> NodeGaussians | None:
-        """The merged Gaussians of some nodes in float32, one after another; of each node those of `drawn`."""
+        """The merged Gaussians of some nodes, one after another; of each node those of `drawn`."""
         parts = [drawn(node) for node in nodes]
-        return _joined(NodeGaussians, parts).float() if parts else None
+        return _joined(NodeGaussians, parts) if parts else None
 
     def anchors_of(
         self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]

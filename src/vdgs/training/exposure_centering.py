@@ -6,12 +6,14 @@ the scene has, and training drifts. Of photograph i let x be (color, 1) of a pix
 
     M = (Σ D_i S_i) (Σ S_i)⁻¹
 
-is nearest to all exposures, by the squares of the differences in their pixels. After each pass over the photographs M
-is taken from all departures, and the colors of the scene follow. (The mean of the departures in place of M does not
-see that cameras expose bright places less, nor how alike red, green and blue are.)
+is nearest to all exposures, by the squares of the differences in their pixels. After each pass over the photographs, as
+training draws them, M is taken from all departures, and the colors of the scene follow. (The mean of the departures in
+place of M does not see that cameras expose bright places less, nor how alike red, green and blue are.)
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
@@ -20,8 +22,9 @@ from torch import Tensor
 
 from vdgs.kernels.transfer import is_host
 
-#: Of each photograph the pixels of every fourth row and column are counted, where the scene is at least so opaque.
-PIXEL_STEP, MIN_ALPHA = 4, 0.5
+#: Of each photograph rows and columns are left out until at most so many pixels are left; those are counted where the
+#: scene is at least so opaque.
+MAX_PIXELS, MIN_ALPHA = 30_000, 0.5
 #: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open.
 RIDGE = 1e-7
 
@@ -44,7 +47,7 @@ def count_exposure(
 ) -> None:
     """Add a photograph with the picture of the scene in neutral colors, in place; pixels that its mask leaves out do
     not count."""
-    part = slice(None, None, PIXEL_STEP)
+    part = slice(None, None, math.ceil(math.sqrt(alpha.numel() / MAX_PIXELS)))
     counted = alpha[part, part] >= MIN_ALPHA
     if mask is not None:
         counted = counted & (mask[part, part] > 0)

@@ -140,12 +140,14 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
 def _count_exposure(
     state: TrainingState, stage: TrainingProblem, view: int, target: TrainingTarget, drawn: RenderedTrainingView
 ) -> None:
-    """Count the exposure of a photograph, and after each pass over all of them move neutral colors to their middle."""
+    """Count the exposure of a photograph, and after each pass over all of them center the exposures; not after the last
+    step, which the colors of the scene could not follow."""
     if (moments := state.exposure_moments) is None or (departures := state.decoder.exposure) is None:
         return
     departure = departures[image_index_at(stage, view)]
     count_exposure(moments, departure, drawn.image, drawn.raster.alpha, target.mask)
-    if (state.iteration + 1) % stage.num_images == 0:
+    made = state.iteration + 1
+    if made % stage.num_images == 0 and made < stage.config.iterations:
         center_exposures(departures.detach(), moments)
 
 

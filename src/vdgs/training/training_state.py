@@ -16,7 +16,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
-from vdgs.model.decoder import Decoder
+from vdgs.model.decoder import EXPOSURE, OLD_EXPOSURE, Decoder
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training.compensation import CompensationState
 from vdgs.training.crops import Crop
@@ -27,8 +27,8 @@ from vdgs.training.weight_averaging import ModelAverage
 
 #: What is trained: the whole scene, or one block of it.
 StageKind = Literal["coarse", "block"]
-#: How the names of the decoder's tensors begin that no block moves: the mean appearance and exposure, in which other
-#: photographs are drawn, must stay the same in all blocks, and so must what is behind all of them.
+#: How the names of the decoder's tensors begin that no block moves: the mean appearance and neutral colors, in which
+#: other photographs are drawn, must stay the same in all blocks, and so must what is behind all of them.
 SHARED_TENSORS = ("appearance", "exposure", "envmap")
 
 
@@ -266,12 +266,15 @@ def _group(saved: Checkpoint, name: str) -> dict[str, Tensor]:
 def from_checkpoint(
     saved: Checkpoint, stage: TrainingProblem, start: Callable[..., TrainingState] = initial_state
 ) -> TrainingState:
-    """The inverse of `to_checkpoint`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing.
+    """The inverse of `to_checkpoint`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing, or
+    exposures are those of an older version.
     `start` makes a new state, of the kind that was saved, as `initial_state` does."""
 
     def group(name: str) -> dict[str, Tensor]:
         return {key: tensor.to(stage.device) for key, tensor in _group(saved, name).items()}
 
+    if f"decoder.{OLD_EXPOSURE}" in saved.tensors:
+        raise KeyError(f"decoder.{EXPOSURE}")
     state = start(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
     state.optimizer.decoder = AdamMoments(group("first.decoder"), group("second.decoder"))
     if averaged := saved.metadata["averaged"]:

@@ -7,7 +7,7 @@ is hidden behind anything else.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -57,9 +57,20 @@ def fade_factors(
     Float32. All are 1 where `least` is 0; 0 where there are fewer cameras, and for a point that is not finite. Raises
     TypeError or ValueError as `count_visibility`.
     """
-    factors = (count_visibility(points, cameras) >= least).float()
+    return fade_by_counts(points, cameras, least, margin, count_visibility)
+
+
+def fade_by_counts(
+    points: Float[Tensor, "n 3"],
+    cameras: Sequence[Camera],
+    least: int,
+    margin: float,
+    count: Callable[[Tensor, Sequence[Camera]], Tensor],
+) -> Float[Tensor, " n"]:
+    """`fade_factors` with a `count_visibility` of one's own: where enough cameras see, nothing else is computed."""
+    factors = (count(points, cameras) >= least).float()
     edge = torch.nonzero(factors == 0)[:, 0]
-    edge = edge[count_visibility(points[edge], [_widened(each, margin) for each in cameras]) >= least]
+    edge = edge[count(points[edge], [_widened(each, margin) for each in cameras]) >= least]
     for some in edge.split(PLACES_AT_ONCE) if len(edge) else ():
         places = points[some].T.contiguous()
         outside = torch.stack([_share_outside(places, camera) for camera in cameras], dim=1)
