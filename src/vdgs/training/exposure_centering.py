@@ -25,8 +25,9 @@ from vdgs.kernels.transfer import is_host
 #: Of each photograph rows and columns are left out until at most so many pixels are left; those are counted where the
 #: scene is at least so opaque.
 MAX_PIXELS, MIN_ALPHA = 30_000, 0.5
-#: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open.
-RIDGE = 1e-7
+#: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open. And so much alone: where
+#: nothing was counted, M is 0.
+RIDGE, TINY = 1e-7, 1e-30
 
 #: Σ D_i S_i above Σ S_i, float64.
 ExposureMoments = Float[Tensor, "7 4"]
@@ -67,8 +68,9 @@ def _sum_of_products(colors: Float[Tensor, "p 4"]) -> Float[Tensor, "4 4"]:
 
 @torch.no_grad()
 def center_exposures(departures: Float[Tensor, "images 3 4"], moments: ExposureMoments) -> None:
-    """Take M from all departures, in place, and set the sums back to 0. Nothing where no photograph was counted."""
-    of_colors = moments[3:] + RIDGE * moments[3:].trace() * torch.eye(4, dtype=moments.dtype, device=moments.device)
-    if float(moments[3:].trace()) > 0:
-        departures -= torch.linalg.solve(of_colors, moments[:3].T).T.to(departures)
+    """Take M from all departures, in place, and set the sums back to 0. M is 0 where nothing was counted."""
+    ridge = RIDGE * moments[3:].trace() + TINY
+    of_colors = moments[3:] + ridge * torch.eye(4, dtype=moments.dtype, device=moments.device)
+    # `solve` would wait for a GPU to see whether it could.
+    departures -= torch.linalg.solve_ex(of_colors, moments[:3].T)[0].T.to(departures)
     moments.zero_()
