@@ -25,8 +25,8 @@ from vdgs.kernels.transfer import is_host
 #: Of each photograph rows and columns are left out until at most so many pixels are left; those are counted where the
 #: scene is at least so opaque.
 MAX_PIXELS, MIN_ALPHA = 30_000, 0.5
-#: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open. And so much alone: where
-#: nothing was counted, M is 0.
+#: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open. And so much alone:
+#: where nothing was counted, M is 0.
 RIDGE, TINY = 1e-7, 1e-30
 
 #: Σ D_i S_i above Σ S_i, float64.
