@@ -3,7 +3,7 @@
     python -m experiments.reports.analyses.neutral_colors RUN [--every 3]
 
 RUN was trained with --exposure-compensation. One map of colors is fitted to neutral renders of every so many training
-photographs, at half of their size, by least squares over the pixels where the scene is opaque and no mask leaves them
+photographs, by least squares over the pixels where the scene is opaque and no mask leaves them
 out. If the colors are neutral, the map gains nothing.
 """
 
@@ -22,7 +22,7 @@ from vdgs.captures.image_cache import ImageCache
 from vdgs.model.renderer import Drawable, render
 from vdgs.runs.open_run import open_run
 
-DOWNSCALE, MIN_ALPHA = 2, 0.5
+MIN_ALPHA = 0.5
 #: Colors of the pixels of a render with a one beside them, and of the photograph.
 Pixels = tuple[Float[np.ndarray, "p 4"], Float[np.ndarray, "p 3"]]
 
@@ -46,9 +46,9 @@ def main() -> None:
 def draw(model: Drawable, views: Sequence[View]) -> list[Pixels]:
     """Each view in neutral colors beside its photograph."""
     found = []
-    with ImageCache(views, 0, downscales=(DOWNSCALE,)) as images:
+    with ImageCache(views, 0) as images:
         for index in range(len(views)):
-            raster, photograph = render(model, images.camera(index, DOWNSCALE)), images.get(index, DOWNSCALE)
+            raster, photograph = render(model, images.camera(index)), images.get(index)
             counted = raster.alpha >= MIN_ALPHA
             counted &= True if photograph.mask is None else photograph.mask > 0
             colors = raster.image[counted].numpy()

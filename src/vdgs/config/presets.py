@@ -6,7 +6,7 @@
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
             smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam; cameras by `coverage`,
             each with a block and each block with a hundred; and a frozen margin.
-`laptop`    a good result in minutes on a CPU: what a few thousand steps ask for; pseudo views and depths that agree, for
+`laptop`    a good result in minutes on a CPU: what a few thousand steps ask for; pseudo views and agreeing depths, for
             views off the path of the flight; and plain growth in blocks, for compensated growth
             (`--block.compensation.enabled`) lost where few cameras look. docs/paper.md says what decided each
             departure.
