@@ -72,8 +72,8 @@ def test_iterations_go_by_the_photographs_as_in_the_preset(training):
 
 def test_small_captures_have_the_budget_of_the_small_ones_with_names():
     assert budget_for(12) == budget_for(50) == LAPTOP_BUDGET == SCENES["copr"].budget
-    assert budget_for(100) == Budget(4_800, 4, 1_200)
-    assert budget_for(10_000) == Budget(24_000, 4, 6_000)
+    assert budget_for(100) == Budget(6_000, 4, 1_500)
+    assert budget_for(10_000) == Budget(30_000, 4, 7_500)
 
 
 def test_the_plan_reads_them_as_asked(captures):
@@ -85,7 +85,7 @@ def test_the_plan_reads_them_as_asked(captures):
     assert dict(scene.options) == {"downscale": 2.0, "test_every": 3}
     assert "8 training and 4 test photographs of 32 x 24" in scene.note
     full = plan.run_of["copr-2", "full", 0].config
-    assert (full.training.iterations, full.partition.blocks, full.assignment.min_cameras) == (2_400, 4, 16)
+    assert (full.training.iterations, full.partition.blocks, full.assignment.min_cameras) == (3_000, 4, 16)
     with pytest.raises(VdgsError, match=r"--downscale, --test-every, --georef: say how a capture is read"):
         make_plan("table2", PlanOptions(scenes=("tiny",), options=options))
 

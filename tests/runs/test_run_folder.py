@@ -205,7 +205,7 @@ def test_validation_names_each_problem():
 
 def test_automatic_iterations_follow_the_number_of_photographs():
     automatic = TrainConfig(iterations=0)
-    assert [resolve_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [2400, 6960, 24_000]
+    assert [resolve_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 8700, 30_000]
     assert resolve_iterations(TrainConfig(iterations=7), 9000).iterations == 7
 
 

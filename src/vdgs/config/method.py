@@ -171,8 +171,8 @@ class TrainConfig:
     """Training of the coarse stage."""
 
     iterations: Annotated[int, Range(0, MAX_COUNT)] = 100_000
-    """Steps of the coarse stage; 0: by photograph count. Each step draws one photograph; 0 takes 48 steps for each
-    training photograph, at least 2400 and at most 24 000 (choice: with few photographs a model overfits soon)."""
+    """Steps of the coarse stage; 0: by photograph count. Each step draws one photograph; 0 takes sixty steps for each
+    training photograph, at least 3000 and at most 30 000 (choice: with few photographs a model overfits soon)."""
     view_sampling: Literal["uniform", "visibility", "sqrt-visibility"] = "uniform"
     """How often each photograph is used. `uniform`: all alike (the paper). `visibility`: every anchor divides one vote
     among the cameras that see it, and photographs are used in proportion to their votes. `sqrt-visibility`: in
@@ -353,7 +353,7 @@ class MethodConfig:
 
 
 #: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
-AUTO_COARSE_ITERATIONS, AUTO_BLOCK_ITERATIONS = (48, 2_400, 24_000), (15, 500, 15_000)
+AUTO_COARSE_ITERATIONS, AUTO_BLOCK_ITERATIONS = (60, 3_000, 30_000), (15, 500, 15_000)
 
 
 def resolve_iterations(config: TrainConfig, num_views: int) -> TrainConfig:
