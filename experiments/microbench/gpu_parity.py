@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -228,6 +228,12 @@ def count_visibility(kernels: KernelBackend, scene: ParityScene) -> Results:
     return {"whole V": kernels.count_visibility(scene.anchors.positions, [scene.camera] * 3)}
 
 
+def fade_factors(kernels: KernelBackend, scene: ParityScene) -> Results:
+    """About a picture of half the size, beyond whose edge much lies."""
+    small = replace(scene.camera, width=scene.camera.width // 2, height=scene.camera.height // 2)
+    return {"factors": kernels.fade_factors(scene.anchors.positions, [small] * 3, 2, 0.15)}
+
+
 def mark_visible(kernels: KernelBackend, scene: ParityScene) -> Results:
     return {"whole marks": kernels.mark_visible(scene.anchors.positions, scene.camera)}
 
@@ -299,7 +305,8 @@ CASES: dict[str, Callable[[KernelBackend, ParityScene], Results]] = {
     case.__name__: case
     for case in (
         adam_rows, adam_tensors, add_view_statistics, cell_centers, cell_keys, contains, count_visibility, cull, decode,
-        decode_for_training, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colors, mark_visible,
+        decode_for_training, decode_backward_adam, fade_factors, fit_harmonics, group_cells, group_max, harmonic_colors,
+        mark_visible,
         mean_ellipsoids, morton_order, photometric_loss, project, rasterize, rasterize_vjp,
         splat_contributions,
     )

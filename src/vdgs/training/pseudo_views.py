@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels.kernel_types import Raster
-from vdgs.kernels.transfer import to_like
+from vdgs.kernels.transfer import to_like, upload
 from vdgs.training.target import TrainingTarget
 
 #: Every so many steps draw a pseudo view, after this share of the iterations: before it depths are vague.
@@ -47,7 +47,8 @@ def pseudo_camera(camera: Camera, raster: Raster, rng: np.random.Generator) -> C
     """A camera about a place that a view, drawn with depth, shows; None where the places tried show nothing."""
     rows, columns = rng.integers(camera.height, size=_TRIES), rng.integers(camera.width, size=_TRIES)
     assert raster.median_depth is not None
-    depths, alphas = torch.stack([each[rows, columns] for each in (raster.median_depth, raster.alpha)]).tolist()
+    pixels = upload(torch.from_numpy(rows * camera.width + columns), raster.alpha.device)
+    depths, alphas = torch.stack([each.flatten()[pixels] for each in (raster.median_depth, raster.alpha)]).tolist()
     tried = zip(rows, columns, depths, alphas, strict=True)
     place = next(((r, c, depth) for r, c, depth, alpha in tried if alpha > MIN_ALPHA and depth > 0), None)
     if place is None:

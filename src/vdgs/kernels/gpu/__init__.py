@@ -15,11 +15,11 @@ from vdgs.kernels.cuda import photometric_loss as photometric_loss
 from vdgs.kernels.cuda import splat_contributions as splat_contributions
 from vdgs.kernels.gpu.rasterizer import rasterize as rasterize
 from vdgs.kernels.gpu.rasterizer import rasterize_vjp as rasterize_vjp
-from vdgs.kernels.gpu.visibility import fade_factors as fade_factors
 from vdgs.kernels.torch_ref import adam_rows as adam_rows
 from vdgs.kernels.torch_ref import cell_centers as cell_centers
 from vdgs.kernels.torch_ref import cell_keys as cell_keys
 from vdgs.kernels.torch_ref import contains as contains
+from vdgs.kernels.torch_ref import fade_factors as fade_factors
 from vdgs.kernels.torch_ref import fit_harmonics as fit_harmonics
 from vdgs.kernels.torch_ref import group_cells as group_cells
 from vdgs.kernels.torch_ref import group_max as group_max

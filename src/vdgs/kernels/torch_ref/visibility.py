@@ -7,7 +7,7 @@ is hidden behind anything else.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
+from vdgs import kernels
 from vdgs.geometry.camera import NEAR_PLANE, Camera
-from vdgs.kernels.transfer import to_like
+from vdgs.kernels.transfer import is_host, to_like
 
 #: Places that all cameras are asked about at once: with a thousand cameras 64 MB.
 PLACES_AT_ONCE = 1 << 14
@@ -57,17 +58,8 @@ def fade_factors(
     Float32. All are 1 where `least` is 0; 0 where there are fewer cameras, and for a point that is not finite. Raises
     TypeError or ValueError as `count_visibility`.
     """
-    return fade_by_counts(points, cameras, least, margin, count_visibility)
-
-
-def fade_by_counts(
-    points: Float[Tensor, "n 3"],
-    cameras: Sequence[Camera],
-    least: int,
-    margin: float,
-    count: Callable[[Tensor, Sequence[Camera]], Tensor],
-) -> Float[Tensor, " n"]:
-    """`fade_factors` with a `count_visibility` of one's own: where enough cameras see, nothing else is computed."""
+    # Where there is a kernel for it, counting tells for less what need not be looked at.
+    count = count_visibility if is_host(points) else kernels.get_backend(points.device).count_visibility
     factors = (count(points, cameras) >= least).float()
     edge = torch.nonzero(factors == 0)[:, 0]
     edge = edge[count(points[edge], [_widened(each, margin) for each in cameras]) >= least]
