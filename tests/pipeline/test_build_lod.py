@@ -118,6 +118,23 @@ def test_places_that_have_faded_out_are_not_drawn_and_have_no_values(scene, mode
         torch.testing.assert_close(drawn, whole / 2, atol=1e-6, rtol=1e-5)
 
 
+def test_parts_of_a_faded_picture_read_each_node_once_on_any_number_of_threads(scene, monkeypatch):
+    camera, read = camera_at(0.0, 0.0, 6.0), list[int]()
+    load = LodTree.load
+    monkeypatch.setattr(LodTree, "load", lambda tree, node: (read.append(node), load(tree, node))[1])
+    pictures = []
+    for threads in (1, 3):
+        monkeypatch.setattr("vdgs.model.lod_tree.get_num_threads", lambda threads=threads: threads)
+        half = scene.with_fade(lambda places: places[:, 0].clamp(0, 1)).at_error(2.0).for_view(camera)
+        top = camera.height // 2
+        for part in (camera.cropped(0, 0, camera.width, top), camera.cropped(0, top, camera.width, camera.height)):
+            pictures.append(render(half, part).image)
+        assert read
+        assert len(set(read)) == len(read)
+        read.clear()
+    assert all(torch.equal(a, b) for a, b in zip(pictures[:2], pictures[2:], strict=True))
+
+
 def test_a_cut_shows_each_place_once_and_is_coarser_the_larger_the_error(scene):
     table, tree = scene.tree.table, scene.tree
     under = [{leaf} if table.anchors[leaf] else set() for leaf in range(len(table))]

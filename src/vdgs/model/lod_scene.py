@@ -17,15 +17,15 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import NodeGaussians, project_splats
-from vdgs.model.lod_tree import LodCut, LodTree, NodeCache
+from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes
 from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
 #: So many of each are kept assembled: those of the last full picture, and those of a preview.
 MAX_ASSEMBLED = 2
-#: By what opacities are multiplied is kept for nodes up to so many bytes.
-FACTOR_CACHE_BYTES = 48 << 20
+#: By what opacities are multiplied is kept for nodes up to so many bytes, and faded nodes up to so many.
+FACTOR_CACHE_BYTES, FADED_CACHE_BYTES = 48 << 20, 192 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +50,8 @@ class LodScene:
     _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
     #: By what opacities are multiplied, for the Gaussians of what was drawn last.
     _factors: NodeCache = field(default_factory=lambda: NodeCache(FACTOR_CACHE_BYTES))
+    #: Nodes as they are drawn where the scene fades: parts of a picture share most of their nodes.
+    _faded: NodeCache = field(default_factory=lambda: NodeCache(FADED_CACHE_BYTES))
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -86,7 +88,8 @@ class LodScene:
 
     def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]]) -> LodScene:
         """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other."""
-        return replace(self, fade=factors, _anchors={}, _gaussians={}, _factors=NodeCache(FACTOR_CACHE_BYTES))
+        kept, faded = NodeCache(FACTOR_CACHE_BYTES), NodeCache(FADED_CACHE_BYTES)
+        return replace(self, fade=factors, _anchors={}, _gaussians={}, _factors=kept, _faded=faded)
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -203,12 +206,20 @@ class LodScene:
 
     def _drawn_gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node that are drawn, faded."""
-        gaussians, factors = self.tree.gaussians(node), self._node_factors(node)
-        if factors is None or not len(faded := (factors < 1).nonzero()[:, 0]):
+        if self.fade is None:
+            return self.tree.gaussians(node)
+        return self._faded.get(("nodes", node), partial(self._faded_gaussians, node), content_bytes)
+
+    def _faded_gaussians(self, node: int) -> NodeGaussians:
+        gaussians = self.tree.load(node)
+        factors = self._content_factors(("nodes", node), lambda: gaussians.means)
+        if factors is None or not len((factors < 1).nonzero()):
             return gaussians
-        logits = gaussians.opacity_logits.clone()
-        logits[faded] = (logits[faded].float().sigmoid() * factors[faded]).logit().to(logits)
-        return replace(gaussians, opacity_logits=logits).select(factors > 0)
+        drawn = factors.nonzero()[:, 0]
+        gaussians, factors = gaussians.select(drawn), factors[drawn]
+        logits = gaussians.opacity_logits.float()
+        faded = torch.where(factors < 1, (logits.sigmoid() * factors).logit(), logits)
+        return replace(gaussians, opacity_logits=faded.to(gaussians.opacity_logits))
 
 
 _Held = TypeVar("_Held")

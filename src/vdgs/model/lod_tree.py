@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from functools import reduce
@@ -22,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vdgs.geometry.camera import NEAR_PLANE, Camera
+from vdgs.kernels import get_num_threads
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
 from vdgs.model.anchors import Anchors
 from vdgs.model.gaussians import NodeGaussians
@@ -33,6 +35,8 @@ CACHE_BYTES = 256 << 20
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.
 ANCHOR_COST = 8
+#: Beyond so many threads reading nodes would take more memory, not less time.
+MAX_READERS = 4
 #: Parts of a view in full detail: places of a leaf's box each way, pixels that count as an anchor, the least size.
 BOX_SAMPLES, PART_PIXELS, MIN_PART_PX = 4, 25, 16
 
@@ -152,28 +156,39 @@ class LodTree:
 
     def gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node as its file has them: places in full, all else in half precision."""
-        return self._cache.get(("nodes", node), lambda: load_node(node_file(self.folder, node)), _bytes)
+        return self._cache.get(("nodes", node), lambda: self.load(node), content_bytes)
+
+    def load(self, node: int) -> NodeGaussians:
+        """Those, read anew and not kept."""
+        return load_node(node_file(self.folder, node))
 
     def anchors(self, leaf: int) -> tuple[Anchors, Tensor]:
         """The anchors of a leaf, and their rows in the model, ascending."""
-        return self._cache.get(
-            ("anchors", leaf), lambda: load_anchors(anchors_file(self.folder, leaf)), lambda content: _bytes(content[0])
-        )
+        file = anchors_file(self.folder, leaf)
+        return self._cache.get(("anchors", leaf), lambda: load_anchors(file), lambda content: content_bytes(content[0]))
 
     def gaussians_of(self, nodes: tuple[int, ...], drawn: Callable[[int], NodeGaussians]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes, one after another; of each node those of `drawn`."""
-        parts = [drawn(node) for node in nodes]
+        parts = _side_by_side(drawn, nodes)
         return _joined(NodeGaussians, parts) if parts else None
 
     def anchors_of(
         self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]
     ) -> tuple[Anchors, Tensor] | None:
         """The anchors of some leaves in the order of the model, and their rows there; of each leaf those of `drawn`."""
-        parts = [drawn(leaf) for leaf in leaves]
+        parts = _side_by_side(drawn, leaves)
         if not parts:
             return None
         rows, order = torch.cat([rows for _, rows in parts]).sort()
         return _joined(Anchors, [anchors for anchors, _ in parts]).select(order), rows
+
+
+def _side_by_side(drawn: Callable[[int], _Content], nodes: tuple[int, ...]) -> list[_Content]:
+    """What some nodes draw, in their order: they are read, checked and faded on as many threads as kernels use."""
+    if (workers := min(get_num_threads(), MAX_READERS, len(nodes))) <= 1:
+        return [drawn(node) for node in nodes]
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(drawn, nodes))
 
 
 def _halve(
@@ -235,5 +250,6 @@ def _joined(kind: type[_Kind], parts: list[_Kind]) -> _Kind:
     return parts[0] if len(parts) == 1 else kind(**{n: torch.cat([p.tensors()[n] for p in parts]) for n in names})
 
 
-def _bytes(content: NodeGaussians | Anchors) -> int:
+def content_bytes(content: NodeGaussians | Anchors) -> int:
+    """Memory that the tensors of a node take."""
     return reduce(lambda total, tensor: total + tensor.nbytes, content.tensors().values(), 0)
