@@ -25,7 +25,7 @@ NodeContent = tuple[str, int]
 #: So many of each are kept assembled: those of the last full picture, and those of a preview.
 MAX_ASSEMBLED = 2
 #: By what opacities are multiplied is kept for nodes up to so many bytes, and faded nodes up to so many.
-FACTOR_CACHE_BYTES, FADED_CACHE_BYTES = 48 << 20, 192 << 20
+FACTOR_CACHE_BYTES, FADED_CACHE_BYTES = 48 << 20, 160 << 20
 
 
 @dataclass(frozen=True, eq=False)
