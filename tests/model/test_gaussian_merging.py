@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from support.gaussians import overhead, picture, psnr, random_gaussians
-from vdgs.model.gaussian_merging import gaussian_weights, group_neighbors, merge_by_moments
+from vdgs.model.gaussian_merging import gaussian_weights, group_neighbors, merge_by_moments, single_members
 from vdgs.model.gaussian_transform import gaussian_covariances, quaternion_from_matrix, transform_gaussians
-from vdgs.model.gaussians import Gaussians, NodeGaussians
+from vdgs.model.gaussians import Gaussians
 
 
 def total(gaussians: Gaussians, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -83,12 +83,25 @@ def test_what_closed_a_surface_closes_it_merged():
 def test_merged_gaussians_cover_what_their_members_cover_through_all_levels():
     """Also where that is more than an opaque Gaussian covers: what one lacks, the next level still knows."""
     some = random_gaussians(400, 1)
-    level = NodeGaussians(**some.tensors(), covers=torch.ones(400))
+    level = single_members(some)
     for count in (100, 20, 1):
         level = merge_by_moments(level, np.arange(len(level)) % count, enlarge=1.0)
         assert len(level.covers) == count
         np.testing.assert_allclose(gaussian_weights(level).sum(), gaussian_weights(some).sum(), rtol=1e-3)
     assert level.covers[0] > 1
+
+
+def test_what_is_known_of_members_is_that_of_all_of_them_through_all_levels():
+    some, rng = random_gaussians(400, 1), np.random.default_rng(2)
+    weights, colors = gaussian_weights(some), rng.uniform(0.1, 3, 400)
+    level = single_members(some, colors)
+    for count in (100, 20, 1):
+        level = merge_by_moments(level, np.arange(len(level)) % count, enlarge=1.0)
+    mean = np.average(np.log(weights), weights=weights)
+    std = np.average((np.log(weights) - mean) ** 2, weights=weights) ** 0.5
+    np.testing.assert_allclose([float(level.log_weight_mean), float(level.log_weight_std)], [mean, std], rtol=1e-3)
+    wanted = np.average(some.sh0.numpy(), axis=0, weights=weights * colors)
+    np.testing.assert_allclose(level.sh0[0].numpy(), wanted, atol=2e-3)
 
 
 def test_flat_gaussians_stay_flat_and_what_has_no_extent_stays_finite():

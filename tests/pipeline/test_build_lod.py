@@ -15,19 +15,22 @@ import torch
 from rich.console import Console
 
 from support.captures import camera_at
+from support.gaussians import random_gaussians
 from support.hand_made_models import camera_above, model_at, opaque_plane
 from vdgs.config.commands import LodRequest
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.export.lod_bake import CameraTable, merge_cells
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.constants import ALPHA_MIN, DILATION_PX2
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.decoder import Decoder
-from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
-from vdgs.model.gaussians import NodeGaussians
+from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments, single_members
+from vdgs.model.gaussians import Gaussians, NodeGaussians
 from vdgs.model.lod_nodes import LOD_FORMAT, TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
-from vdgs.model.lod_scene import LodScene, merged_splats
+from vdgs.model.lod_scene import LodScene
+from vdgs.model.lod_splats import merged_splats, shown_shares
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
@@ -219,10 +222,10 @@ def test_cells_merge_what_lies_nearest_to_their_means():
     """Seen on a line: a Gaussian beside the border of a cell joins those of the next cell that are nearer."""
     x = torch.tensor([0.0, 0.1, 0.95, 1.05, 1.1, 1.15])
     place = torch.stack([x, x * 0, x * 0], 1)
-    some = NodeGaussians(
+    some = single_members(Gaussians(
         means=place, log_scales=torch.full((6, 3), -3.0), quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1),
-        opacity_logits=torch.zeros(6), sh0=torch.zeros(6, 3), shN=torch.zeros(6, 3, 3), covers=torch.ones(6),
-    )  # fmt: skip
+        opacity_logits=torch.zeros(6), sh0=torch.zeros(6, 3), shN=torch.zeros(6, 3, 3),
+    ))  # fmt: skip
     merged, _ = merge_cells(some, 1.0, np.zeros(6))
     torch.testing.assert_close(merged.means[:, 0], torch.tensor([0.05, 1.0625]), atol=1e-5, rtol=0)
 
@@ -230,11 +233,10 @@ def test_cells_merge_what_lies_nearest_to_their_means():
 def test_from_afar_one_gaussian_dims_as_much_as_the_many_that_it_stands_for_and_near_by_no_more_than_an_opaque_one():
     """A stack of Gaussians smaller than a pixel, each drawn as transparent as its blur makes it."""
     places = np.random.default_rng(5).uniform(-0.02, 0.02, (100, 3)).astype(np.float32)
-    many = NodeGaussians(
+    many = single_members(Gaussians(
         means=torch.from_numpy(places), log_scales=torch.full((100, 3), -4.0), opacity_logits=torch.zeros(100),
         quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(100, 1), sh0=torch.zeros(100, 3), shN=torch.zeros(100, 3, 3),
-        covers=torch.ones(100),
-    )  # fmt: skip
+    ))  # fmt: skip
     one = merge_by_moments(many, np.zeros(100, np.int64), enlarge=1.0)
     assert one.covers[0] > 10
     far, near = (merged_splats(one, camera_at(0.0, 0.0, height)).opacities for height in (30.0, 0.1))
@@ -242,6 +244,34 @@ def test_from_afar_one_gaussian_dims_as_much_as_the_many_that_it_stands_for_and_
     through = (1 - merged_splats(many, camera_at(0.0, 0.0, 30.0)).opacities).prod()
     torch.testing.assert_close(far[0], 1 - through, rtol=0.05, atol=0)
     assert 0.99 < float(near[0]) <= 0.999 + 1e-6
+
+
+def of_members(log_mean: np.ndarray, log_std: np.ndarray) -> NodeGaussians:
+    """Merged Gaussians whose members have such weights."""
+    chosen = single_members(random_gaussians(len(log_mean), 1))
+    return replace(chosen, log_weight_mean=torch.tensor(log_mean).float(), log_weight_std=torch.tensor(log_std).float())
+
+
+def test_members_too_small_to_be_drawn_show_nothing_in_the_gaussian_that_stands_for_them():
+    """What is left of members of many sizes below `ALPHA_MIN`, by the mean of their drawn shares."""
+    camera, rng = camera_at(0.0, 0.0, 30.0), np.random.default_rng(3)
+    least = ALPHA_MIN * DILATION_PX2 * 30.0**2 / (camera.fx * camera.fy)
+    alone = np.array([0.3, 0.99, 1.5, 4.0, 1e4])
+    weights = least * np.exp(rng.normal(0.4, 1.2, 400_000))
+    for std, mean, wanted in (
+        (np.zeros(5), np.log(least * alone), np.maximum(0, 1 - 1 / alone)),
+        # Weighted by themselves, logarithms that are normally distributed are so with the same deviation.
+        (np.array([1.2]), np.array([np.log(least) + 0.4 + 1.2**2]),
+         [np.average(np.maximum(0, 1 - least / weights), weights=weights)]),
+        (np.array([7.0, 0.0]), np.log(least) + np.array([-300.0, 300.0]), [0.0, 1.0]),
+    ):  # fmt: skip
+        shown = shown_shares(of_members(mean, std), torch.full((len(mean),), 30.0), camera)
+        np.testing.assert_allclose(shown.numpy(), wanted, atol=5e-3)
+    ortho = replace(camera, model="orthographic", fx=camera.fx / 30, fy=camera.fy / 30)
+    few = of_members(np.array([-9.0, -12.0, -15.0]), np.ones(3))
+    torch.testing.assert_close(
+        shown_shares(few, torch.tensor([1.0, 2.0, 3.0]), ortho), shown_shares(few, torch.full((3,), 30.0), camera)
+    )
 
 
 def test_memory_is_bounded_by_what_was_asked_for(scene):

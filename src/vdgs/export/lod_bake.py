@@ -21,7 +21,7 @@ from vdgs.export.bake import BakeViews, fit_gaussians, gaussian_count, view_cont
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments
+from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments, single_members
 from vdgs.model.gaussians import Gaussians, NodeGaussians
 from vdgs.model.lod_nodes import NodeRecord
 
@@ -37,20 +37,22 @@ SAMPLES = 128
 SH_DEGREE = 1
 #: A leaf's Gaussians are off by at least this part of a cell: they are no anchors, which change with the view.
 MIN_LEAF_ERROR = 0.1
+#: No color counts for less or for more, in parts of its weight: half precision holds as much.
+COLOR_WEIGHTS = 1e-3, 1e3
 
 
-def bake_leaf(model: AnchorModel, cameras: CameraTable) -> Gaussians:
-    """The Gaussians that the best training cameras see of a few anchors."""
+def bake_leaf(model: AnchorModel, cameras: CameraTable) -> tuple[Gaussians, Float[np.ndarray, " n"]]:
+    """The Gaussians that the best training cameras see of a few anchors, and how many pixels each makes there."""
     positions = model.anchors.positions.numpy()
     windows = [window for camera in cameras.choose(positions) if (window := _turned(camera, positions)) is not None]
     shown = [view_contributions(model, window) for window in windows]
-    seen = np.zeros(gaussian_count(model), bool)
+    pixels = np.zeros(gaussian_count(model))
     for view in shown:
-        seen[view.gaussians.numpy()] = True
-    wanted = np.flatnonzero(seen)
+        pixels[view.gaussians.numpy()] += view.pixels.numpy()
+    wanted = np.flatnonzero(pixels)
     if not len(wanted):
-        return empty_gaussians(SH_DEGREE)
-    return fit_gaussians(BakeViews(model, windows, shown), wanted, SH_DEGREE)
+        return empty_gaussians(SH_DEGREE), pixels[wanted]
+    return fit_gaussians(BakeViews(model, windows, shown), wanted, SH_DEGREE), pixels[wanted]
 
 
 def with_learnt_blur(gaussians: Gaussians, pixel: float) -> Gaussians:
@@ -188,12 +190,19 @@ class CameraTable:
 
 def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tuple[NodeGaussians, float]:
     """What a leaf draws instead of its anchors, and how far off it is."""
-    baked = with_learnt_blur(bake_leaf(model, cameras), max(cameras.pixel, model.photograph_pixel))
-    cell = edge / CELLS_PER_EDGE
-    merged, error = merge_cells(
-        NodeGaussians(**baked.tensors(), covers=torch.ones(len(baked))), cell, np.zeros(len(baked))
-    )
+    baked, pixels = bake_leaf(model, cameras)
+    baked, cell = with_learnt_blur(baked, max(cameras.pixel, model.photograph_pixel)), edge / CELLS_PER_EDGE
+    members = single_members(baked, _color_weights(baked, pixels))
+    merged, error = merge_cells(members, cell, np.zeros(len(baked)))
     return merged, max(error, MIN_LEAF_ERROR * cell)
+
+
+def _color_weights(baked: Gaussians, pixels: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """By how much colors count beside the weights of a leaf's Gaussians: what cameras see of it shows in pictures, what
+    lies behind does not, but from elsewhere may. The root is a choice (reports/levels-of-detail.md)."""
+    weights = gaussian_weights(baked)
+    seen = pixels * weights.sum() / np.maximum(weights * pixels.sum(), 1e-300)
+    return np.clip(np.sqrt(seen), *COLOR_WEIGHTS)
 
 
 def parent_gaussians(

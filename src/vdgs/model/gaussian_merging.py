@@ -10,11 +10,11 @@ neighbors of its own color on its own surface, goes first; a roof's edge and a r
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -51,40 +51,89 @@ def merge_by_moments(
     larger, up to `enlarge` times, and `NodeGaussians` keep what is still missing. What is alone in its group stays as
     it is.
     """
-    order = np.argsort(groups, kind="stable")
-    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
-    sizes = np.diff(starts, append=len(order))
-    weights = gaussian_weights(gaussians) if weights is None else np.maximum(weights, 1e-30)
-    share = (weights / np.repeat(np.add.reduceat(weights[order], starts), sizes)[np.argsort(order)])[order]
-    rows = torch.from_numpy(order)
-
-    def pooled(values: Tensor) -> Tensor:
-        flat = values.reshape(len(values), -1)[rows].double().numpy()
-        sums = np.add.reduceat(flat * share[:, None], starts)
-        return torch.from_numpy(sums.reshape(len(starts), *values.shape[1:]))
-
-    means = pooled(gaussians.means)
-    apart = gaussians.means.double() - means[torch.from_numpy(groups)]
-    spread = pooled(gaussian_covariances(gaussians).double() + apart[:, :, None] * apart[:, None, :])
+    pool = _Pool.of(gaussians, groups, weights)
+    means = pool.mean(gaussians.means)
+    apart = gaussians.means.double() - means[pool.groups]
+    spread = pool.mean(gaussian_covariances(gaussians).double() + apart[:, :, None] * apart[:, None, :])
     log_scales, quaternions = ellipsoid_axes(spread)
-    cover = torch.from_numpy(gaussian_weights(gaussians))
+    colors = gaussians.color_weight if isinstance(gaussians, NodeGaussians) else None
     together = Gaussians(
         means=means, log_scales=log_scales, quaternions=quaternions, opacity_logits=means[:, 0],
-        sh0=pooled(gaussians.sh0), shN=pooled(gaussians.shN),
+        sh0=pool.mean(gaussians.sh0, colors), shN=pool.mean(gaussians.shN, colors),
     )  # fmt: skip
-    opacity = torch.from_numpy(np.add.reduceat(cover[rows].numpy(), starts)) / _areas(together)
+    opacity = pool.sum(torch.from_numpy(gaussian_weights(gaussians))) / _areas(together)
     larger = (opacity / MAX_OPACITY).clamp(1, enlarge**2)
     merged = together.tensors() | {
         "opacity_logits": torch.logit((opacity / larger).clamp(1e-6, MAX_OPACITY)),
         "log_scales": log_scales + larger.log()[:, None] / 2,
     }
     if isinstance(gaussians, NodeGaussians):
+        merged |= _merged_members(gaussians, pool)
         merged["covers"] = (opacity / larger / MAX_OPACITY).clamp(1, MAX_COVERS)
-    first, alone = gaussians.select(torch.from_numpy(order[starts])), torch.from_numpy(sizes == 1)
+    first = gaussians.select(pool.first)
     return replace(gaussians, **{
-        name: torch.where(alone.reshape(-1, *[1] * (value.dim() - 1)), first.tensors()[name], value.float())
+        name: torch.where(pool.alone.reshape(-1, *[1] * (value.dim() - 1)), first.tensors()[name], value.float())
         for name, value in merged.items()
     })  # fmt: skip
+
+
+def single_members(gaussians: Gaussians, color_weights: Float[np.ndarray, " n"] | None = None) -> NodeGaussians:
+    """Gaussians to be merged, each of which stands for itself alone. Their colors count by their weights, times
+    `color_weights` where given."""
+    one = torch.ones(len(gaussians))
+    return NodeGaussians(
+        **gaussians.tensors(), covers=one, log_weight_mean=torch.from_numpy(gaussian_weights(gaussians)).log().float(),
+        log_weight_std=0 * one, color_weight=one if color_weights is None else torch.from_numpy(color_weights).float(),
+    )  # fmt: skip
+
+
+def _merged_members(gaussians: NodeGaussians, pool: _Pool) -> dict[str, Tensor]:
+    """What merged Gaussians know of the members of all."""
+    mean = pool.mean(gaussians.log_weight_mean)
+    apart = gaussians.log_weight_mean.double() - mean[pool.groups]
+    std = pool.mean(gaussians.log_weight_std.double() ** 2 + apart**2).sqrt()
+    return {"log_weight_mean": mean, "log_weight_std": std, "color_weight": pool.mean(gaussians.color_weight)}
+
+
+@dataclass(frozen=True)
+class _Pool:
+    """The m groups of n Gaussians, and how much each Gaussian weighs in its own."""
+
+    groups: Int64[Tensor, " n"]
+    #: The Gaussians in the order of their groups; where each group begins there, and its first member.
+    order: Int64[Tensor, " n"]
+    starts: Int[np.ndarray, " m"]
+    first: Int64[Tensor, " m"]
+    #: Whether a group has one member.
+    alone: Bool[Tensor, " m"]
+    #: Of the weight of the group, in that order.
+    shares: Float[np.ndarray, " n"]
+
+    @staticmethod
+    def of(gaussians: Gaussians, groups: Int[np.ndarray, " n"], weights: Float[np.ndarray, " n"] | None) -> _Pool:
+        order = np.argsort(groups, kind="stable")
+        starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
+        sizes = np.diff(starts, append=len(order))
+        weights = gaussian_weights(gaussians) if weights is None else np.maximum(weights, 1e-30)
+        shares = weights[order] / np.repeat(np.add.reduceat(weights[order], starts), sizes)
+        rows = torch.from_numpy(order)
+        return _Pool(
+            torch.from_numpy(groups).long(), rows, starts, rows[torch.from_numpy(starts)],
+            torch.from_numpy(sizes == 1), shares,
+        )  # fmt: skip
+
+    def sum(self, values: Float[Tensor, " n *c"]) -> Float[Tensor, " m *c"]:
+        """The sum of each group, in float64."""
+        return torch.from_numpy(np.add.reduceat(values[self.order].double().numpy(), self.starts))
+
+    def mean(self, values: Float[Tensor, " n *c"], also: Float[Tensor, " n"] | None = None) -> Float[Tensor, " m *c"]:
+        """The mean of each group by weight, in float64; by weight times `also` where given."""
+        shares = self.shares if also is None else self.shares * also[self.order].double().numpy()
+        flat = values.reshape(len(values), -1)[self.order].double().numpy()
+        sums = np.add.reduceat(flat * shares[:, None], self.starts)
+        if also is not None:
+            sums /= np.add.reduceat(shares, self.starts)[:, None]
+        return torch.from_numpy(sums.reshape(len(self.starts), *values.shape[1:]))
 
 
 def merge_to(gaussians: Gaussians, max_count: int) -> tuple[Gaussians, float]:

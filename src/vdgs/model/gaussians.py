@@ -72,10 +72,17 @@ class Gaussians:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeGaussians(Gaussians):
-    """Gaussians that may stand for more than they can cover themselves, as where surfaces lie behind each other."""
+    """Gaussians that stand for others, their members (`gaussian_merging.single_members`): also for more than they can
+    cover themselves, as where surfaces lie behind each other."""
 
     #: What the members cover, in parts of what the Gaussian covers where it is opaque; 1 where it is less.
     covers: Float[Tensor, " n"]
+    #: Mean and standard deviation of the logarithms of the members' weights (`gaussian_merging.gaussian_weights`), each
+    #: counted by its weight.
+    log_weight_mean: Float[Tensor, " n"]
+    log_weight_std: Float[Tensor, " n"]
+    #: By how much the members' colors count for more, or less, than their weights.
+    color_weight: Float[Tensor, " n"]
 
 
 @torch.no_grad()

@@ -16,9 +16,10 @@ from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
-from vdgs.model.gaussians import NodeGaussians, project_splats
+from vdgs.model.gaussians import NodeGaussians
+from vdgs.model.lod_splats import merged_splats
 from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes
-from vdgs.model.renderer import compensated_splats, cull_anchors, view_splats, without_aliasing
+from vdgs.model.renderer import cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
@@ -219,7 +220,10 @@ class LodScene:
         gaussians, factors = gaussians.select(drawn), factors[drawn]
         logits = gaussians.opacity_logits.float()
         faded = torch.where(factors < 1, (logits.sigmoid() * factors).logit(), logits)
-        return replace(gaussians, opacity_logits=faded.to(gaussians.opacity_logits))
+        # Members fade as the Gaussian does that stands for them.
+        weights = gaussians.log_weight_mean.float() + factors.float().log()
+        half = gaussians.opacity_logits.dtype
+        return replace(gaussians, opacity_logits=faded.to(half), log_weight_mean=weights.to(half))
 
 
 _Held = TypeVar("_Held")
@@ -235,16 +239,6 @@ def _held(
         held.pop(next(iter(held)), None)
     held[nodes] = content
     return content
-
-
-def merged_splats(gaussians: NodeGaussians, camera: Camera) -> Splats:
-    """The splats of merged Gaussians in a view, without aliasing: the blur that the model has learnt is part of them
-    (`export.lod_bake`). One that covers several times as much as itself is drawn as so many behind each other, each as
-    transparent as the blur makes it."""
-    splats = project_splats(gaussians, camera, gaussians.sh_degree)
-    shares = compensated_splats(replace(splats, opacities=torch.ones_like(splats.opacities)), camera, 0.0).opacities
-    # 1 - (1 - share) ** covers
-    return replace(splats, opacities=splats.opacities * -torch.expm1(gaussians.covers * torch.log1p(-shares)))
 
 
 def model_of_rows(model: AnchorModel, anchors: Anchors, rows: Int[Tensor, " r"]) -> AnchorModel:
