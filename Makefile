@@ -49,7 +49,7 @@ demo: setup
 	rm -rf $(DEMO)
 	$(BIN)/vdgs synth $(DEMO)/capture
 	$(BIN)/vdgs inspect $(DEMO)/capture --output $(DEMO)/inspect
-	$(BIN)/vdgs run $(DEMO)/capture --output $(DEMO)/run --preset laptop --blocks 4 --iterations 1700 --block.iterations 450
+	$(BIN)/vdgs run $(DEMO)/capture --output $(DEMO)/run --preset laptop --blocks 4 --iterations 1600 --block.iterations 420
 	$(BIN)/vdgs export $(DEMO)/run --output $(DEMO)/run/scene.html --color-iterations 1
 	@echo
 	@echo "test views:  $(DEMO)/run/evaluation/contact_sheet.png"
