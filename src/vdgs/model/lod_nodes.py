@@ -20,11 +20,10 @@ from torch import Tensor
 from vdgs.errors import VdgsError
 from vdgs.model.anchors import Anchors
 from vdgs.model.gaussians import NodeGaussians
+from vdgs.model.lod_format import LOD_FORMAT, NODE_FORMAT
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import read_tensors, read_tensors_unchecked, tensors_crc32, write_tensors
 
-TREE_FILE = "tree.safetensors"
-LOD_FORMAT, NODE_FORMAT = "vdgs-lod-4", "vdgs-lod-node-3"
 #: What to do about a tree that cannot be used.
 REBUILD_HINT = "Delete that folder and make the tree again: vdgs lod RUN"
 

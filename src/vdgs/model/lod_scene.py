@@ -18,15 +18,15 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_splats import merged_splats
-from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes
+from vdgs.model.lod_tree import LodCut, LodTree, content_bytes
 from vdgs.model.renderer import cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
+#: Reads, or makes, the places of one of these.
+Places = Callable[[], Float[Tensor, "p 3"]]
 #: So many of each are kept assembled: those of the last full picture, and those of a preview.
 MAX_ASSEMBLED = 2
-#: By what opacities are multiplied is kept for nodes up to so many bytes, and faded nodes up to so many.
-FACTOR_CACHE_BYTES, FADED_CACHE_BYTES = 48 << 20, 160 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +44,13 @@ class LodScene:
     pixel: float | None = None
     #: What opacities are multiplied with, by the places of Gaussians; None: nothing.
     fade: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]] | None = None
+    #: By which the tree keeps what has faded so.
+    fade_name: str = ""
     #: Of a leaf only those anchors are put together that a view may show, and they alone are places: most of a leaf is
     #: beside a small part of a view.
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
     _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
-    #: By what opacities are multiplied, for the Gaussians of what was drawn last.
-    _factors: NodeCache = field(default_factory=lambda: NodeCache(FACTOR_CACHE_BYTES))
-    #: Nodes as they are drawn where the scene fades: parts of a picture share most of their nodes.
-    _faded: NodeCache = field(default_factory=lambda: NodeCache(FADED_CACHE_BYTES))
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -87,10 +85,10 @@ class LodScene:
         """The same scene, its anchors drawn as `renderer.Antialiased` draws them."""
         return replace(self, pixel=pixel)
 
-    def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]]) -> LodScene:
-        """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other."""
-        kept, faded = NodeCache(FACTOR_CACHE_BYTES), NodeCache(FADED_CACHE_BYTES)
-        return replace(self, fade=factors, _anchors={}, _gaussians={}, _factors=kept, _faded=faded)
+    def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]], name: str) -> LodScene:
+        """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other. The tree
+        keeps what it has faded by `name`."""
+        return replace(self, fade=factors, fade_name=name, _anchors={}, _gaussians={})
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -120,9 +118,9 @@ class LodScene:
         columns = zip(*((s.means_px, s.conics, s.depths, s.colors, s.opacities) for s in shown), strict=True)
         return torch.cat(sources), Splats(*(torch.cat(column) for column in columns))
 
-    def values(self, camera: Camera, of: Callable[[NodeContent, Float[Tensor, "p 3"]], Tensor]) -> Tensor:
+    def values(self, camera: Camera, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
         """A value for each of the places that a view is drawn from, anchors and then centers of merged Gaussians:
-        `of` gives those of the places of a node, or of the anchors of a leaf."""
+        `of` gives those of the places of a node, or of the anchors of a leaf, which may have to be read."""
         cut, found = self._cut(camera), list[Tensor]()
         if cut.leaves:
             found.append(self._leaf_values(cut.leaves, camera, of))
@@ -130,19 +128,24 @@ class LodScene:
             found += [self._node_values(node, of) for node in cut.nodes]
         return torch.cat(found) if found else torch.zeros(0)
 
-    def _node_values(self, node: int, of: Callable[[NodeContent, Tensor], Tensor]) -> Tensor:
+    def _node_values(self, node: int, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
         """Values of the merged Gaussians of a node that are drawn."""
-        values, factors = of(("nodes", node), self.tree.gaussians(node).means), self._node_factors(node)
+        values = of(("nodes", node), partial(self._node_places, node))
+        factors = self._factors(("nodes", node), partial(self._node_places, node))
         return values if factors is None else values[factors > 0]
 
+    def _node_places(self, node: int) -> Float[Tensor, "m 3"]:
+        """Where the merged Gaussians of a node lie. Of a scene that fades only what is drawn is kept in memory."""
+        return (self.tree.gaussians(node) if self.fade is None else self.tree.load(node)).means
+
     def _leaf_values(
-        self, leaves: tuple[int, ...], camera: Camera, of: Callable[[NodeContent, Tensor], Tensor]
+        self, leaves: tuple[int, ...], camera: Camera, of: Callable[[NodeContent, Places], Tensor]
     ) -> Tensor:
         """Values of the anchors of some leaves that are drawn in a view, in the order of the model."""
         rows, found = list[Tensor](), list[Tensor]()
         for leaf in leaves:
             anchors, these = self.tree.anchors(leaf)
-            values = of(("anchors", leaf), anchors.positions)
+            values = of(("anchors", leaf), partial(getattr, anchors, "positions"))
             mask = self._leaf_mask(anchors, self._leaf_factors(leaf, anchors), camera)
             rows.append(these if mask is None else these[mask])
             found.append(values if mask is None else values[mask])
@@ -150,7 +153,7 @@ class LodScene:
 
     def _leaf_factors(self, leaf: int, anchors: Anchors) -> Float[Tensor, "a k"] | None:
         """What the opacities of the Gaussians of a leaf's anchors are multiplied with; None: nothing."""
-        found = self._content_factors(("anchors", leaf), lambda: gaussian_means(anchors).flatten(0, 1))
+        found = self._factors(("anchors", leaf), lambda: gaussian_means(anchors).flatten(0, 1))
         return None if found is None else found.view(anchors.offsets.shape[:2])
 
     def _leaf_mask(self, anchors: Anchors, factors: Tensor | None, camera: Camera) -> Tensor | None:
@@ -162,11 +165,7 @@ class LodScene:
             mask = seen if mask is None else mask & seen
         return mask
 
-    def _node_factors(self, node: int) -> Float[Tensor, " m"] | None:
-        """What the opacities of the merged Gaussians of a node are multiplied with; None: nothing."""
-        return self._content_factors(("nodes", node), lambda: self.tree.gaussians(node).means)
-
-    def _content_factors(self, content: NodeContent, places: Callable[[], Tensor]) -> Float[Tensor, " p"] | None:
+    def _factors(self, content: NodeContent, places: Places) -> Float[Tensor, " p"] | None:
         """`fade` of the places of a node; what was asked for lately is kept."""
         if (fade := self.fade) is None:
             return None
@@ -176,7 +175,10 @@ class LodScene:
             is_inside = bool((factors == 1).all())  # as most nodes are: one figure for all their Gaussians
             return factors.new_ones(1).expand(len(factors)) if is_inside else factors
 
-        return self._factors.get(content, counted, lambda factors: factors.untyped_storage().nbytes())
+        kind, node = content
+        return self.tree.keep(
+            (f"factors of {kind}, {self.fade_name}", node), counted, lambda f: f.untyped_storage().nbytes()
+        )
 
     def _cut(self, camera: Camera) -> LodCut:
         cut = self._cut_of(camera)
@@ -209,11 +211,11 @@ class LodScene:
         """The merged Gaussians of a node that are drawn, faded."""
         if self.fade is None:
             return self.tree.gaussians(node)
-        return self._faded.get(("nodes", node), partial(self._faded_gaussians, node), content_bytes)
+        return self.tree.keep((f"nodes, {self.fade_name}", node), partial(self._faded_gaussians, node), content_bytes)
 
     def _faded_gaussians(self, node: int) -> NodeGaussians:
         gaussians = self.tree.load(node)
-        factors = self._content_factors(("nodes", node), lambda: gaussians.means)
+        factors = self._factors(("nodes", node), lambda: gaussians.means)
         if factors is None or not len((factors < 1).nonzero()):
             return gaussians
         drawn = factors.nonzero()[:, 0]

@@ -27,10 +27,11 @@ from vdgs.kernels import get_num_threads
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
 from vdgs.model.anchors import Anchors
 from vdgs.model.gaussians import NodeGaussians
-from vdgs.model.lod_nodes import TREE_FILE, LodTable, anchors_file, load_anchors, load_node, node_file
+from vdgs.model.lod_format import TREE_FILE
+from vdgs.model.lod_nodes import LodTable, anchors_file, load_anchors, load_node, node_file
 
-#: Nodes are kept in memory up to so many bytes.
-CACHE_BYTES = 256 << 20
+#: Nodes, and what scenes make of them, are kept in memory up to so many bytes.
+CACHE_BYTES = 320 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.
@@ -154,9 +155,13 @@ class LodTree:
         other._cache = NodeCache(cache_bytes)
         return other
 
+    def keep(self, key: tuple[str, int], make: Callable[[], _Content], size: Callable[[_Content], int]) -> _Content:
+        """What is kept by a key, or is made; `size` in bytes. What was used longest ago goes first."""
+        return self._cache.get(key, make, size)
+
     def gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node as its file has them: places in full, all else in half precision."""
-        return self._cache.get(("nodes", node), lambda: self.load(node), content_bytes)
+        return self.keep(("nodes", node), lambda: self.load(node), content_bytes)
 
     def load(self, node: int) -> NodeGaussians:
         """Those, read anew and not kept."""
@@ -165,7 +170,7 @@ class LodTree:
     def anchors(self, leaf: int) -> tuple[Anchors, Tensor]:
         """The anchors of a leaf, and their rows in the model, ascending."""
         file = anchors_file(self.folder, leaf)
-        return self._cache.get(("anchors", leaf), lambda: load_anchors(file), lambda content: content_bytes(content[0]))
+        return self.keep(("anchors", leaf), lambda: load_anchors(file), lambda content: content_bytes(content[0]))
 
     def gaussians_of(self, nodes: tuple[int, ...], drawn: Callable[[int], NodeGaussians]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes, one after another; of each node those of `drawn`."""

@@ -133,7 +133,7 @@ def _with_fade(request: RenderRequest, run: OpenedModel, scene: Drawable, camera
         return scene
     if isinstance(scene, LodScene):
         nearby = NearbyCameras(cameras)
-        return scene.with_fade(lambda places: nearby.fade_factors(places, least))
+        return scene.with_fade(lambda places: nearby.fade_factors(places, least), f"V {least}")
     return with_fade(run.model, cameras, least)
 
 

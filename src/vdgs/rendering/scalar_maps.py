@@ -140,7 +140,7 @@ def _visibility(run: OpenedModel, scene: Drawable, run_cameras: RunCameras) -> S
     counts = get_run_visibility(run, run_cameras.cameras) if tree is None else count(tree.tree.gaussians(0).means)
 
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
-        of_view = counts.float() if tree is None else tree.values(camera, lambda _, places: count(places))
+        of_view = counts.float() if tree is None else tree.values(camera, lambda _, places: count(places()))
         return render_scalar_map(scene, of_view, camera).cpu().numpy().astype(np.float32)
 
     return ScalarMap(values, visibility_scale(counts.cpu().numpy()), meaning)

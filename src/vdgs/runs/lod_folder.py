@@ -6,30 +6,30 @@ import torch
 
 from vdgs.config.commands import ModelName
 from vdgs.errors import RunError
-from vdgs.model.lod_nodes import TREE_FILE
+from vdgs.model.lod_format import TREE_FILE
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import Drawable
-from vdgs.runs.lod_status import lod_folder
+from vdgs.runs.lod_status import is_of_present_version, lod_folder
 from vdgs.runs.open_run import ModelLocation, OpenedModel, locate_model, open_mapped
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.quoting import shell_word
 
 
 def has_lod(run: RunFolder, location: ModelLocation) -> bool:
-    """Whether a run has a finished tree of this very model. By its status alone, which costs nothing."""
+    """Whether a run has a finished tree of this very model that this version reads: by its status and a header."""
     folder = lod_folder(run)
     status = folder.status()
     of_model = status.state == "done" and status.model_id == location.stage.status().model_id
-    return of_model and (folder.path / TREE_FILE).exists()
+    return of_model and (folder.path / TREE_FILE).exists() and is_of_present_version(run)
 
 
 def find_tree(opened: OpenedModel) -> LodScene | None:
-    """The tree of an opened model, on its device; None where there is none of this model."""
+    """The tree of an opened model, on its device; None where there is none of this model that this version reads."""
     status = lod_folder(opened.folder).status()
     if status.state != "done" or status.model_id != opened.status.model_id or status.model_id is None:
         return None
-    return open_tree(opened)
+    return open_tree(opened) if is_of_present_version(opened.folder) else None
 
 
 def open_lod(run: RunFolder, which: ModelName = "best", device: str = "cpu") -> tuple[OpenedModel, LodScene]:
@@ -54,6 +54,8 @@ def open_tree(opened: OpenedModel, device: torch.device | None = None) -> LodSce
     again += f" --model {opened.name}" if opened.name == "coarse" else ""
     if not (folder.path / TREE_FILE).exists():
         raise RunError(f"{folder.path}: there is no finished level-of-detail tree. {again}")
+    if not is_of_present_version(opened.folder):
+        raise RunError(f"{folder.path}: the level-of-detail tree is of another version of vdgs. {again}")
     tree = LodTree(folder.path)
     if tree.table.model_id != opened.status.model_id:
         raise RunError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from vdgs.model.lod_format import TREE_FILE, is_present_format
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, StageState, StageStatus
 from vdgs.runs.stage_folder import StageFolder
@@ -12,6 +13,11 @@ from vdgs.system.quoting import shell_word
 def lod_folder(run: RunFolder) -> StageFolder:
     """Where the tree of a run lies."""
     return StageFolder(run.path / "lod")
+
+
+def is_of_present_version(run: RunFolder) -> bool:
+    """Whether the tree of a run, where there is one, can be read by this version."""
+    return is_present_format(lod_folder(run).path / TREE_FILE)
 
 
 def lod_status(run: RunFolder, status: RunStatus) -> tuple[StageStatus, ...]:
@@ -25,6 +31,8 @@ def lod_status(run: RunFolder, status: RunStatus) -> tuple[StageStatus, ...]:
     reason = "" if state == "done" else "it continues"
     if state == "done" and found.model_id not in models:
         state, reason = "stale", "made of another model than the run has now"
+    elif state == "done" and not is_of_present_version(run):
+        state, reason = "stale", "made by another version of vdgs"
     elif state == "stopped" and is_known_locked(folder.path):
         state, reason = "running", ""
     command = f"vdgs lod {shell_word(run.path)}"

@@ -25,9 +25,11 @@ from vdgs.captures.first_view import FOV_DEG
 from vdgs.config.commands import ViewRequest
 from vdgs.errors import Interrupted, VdgsError
 from vdgs.kernels.idle_memory import trim_heap
+from vdgs.runs.lod_status import is_of_present_version
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.memory.process_memory import limit_malloc_arenas
+from vdgs.system.quoting import shell_word
 from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
 from vdgs.viewer import navigation
 from vdgs.viewer.access_control import ALL_INTERFACES, AccessControl, is_loopback
@@ -55,6 +57,12 @@ def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], N
     run = open_run_or_checkpoint(request.run, request.model, request.device)
     if run.warning:
         console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    if not is_of_present_version(run.folder):
+        console.print(
+            f"[yellow]warning[/] the level-of-detail tree is of another version of vdgs, so that all of the model is "
+            f"drawn. Make it again: vdgs lod {shell_word(run.folder.path)}",
+            highlight=False,
+        )
     # Ctrl-C is how it ends, not how it fails, from the moment that the address is printed. Asked for anew: what reads
     # captures has set a handler of its own.
     ending = contextlib.suppress(KeyboardInterrupt, Interrupted)

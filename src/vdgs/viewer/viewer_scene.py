@@ -21,7 +21,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.lod_scene import LodScene, NodeContent
+from vdgs.model.lod_scene import LodScene, NodeContent, Places
 from vdgs.model.lod_tree import ANCHOR_COST, LodTree
 from vdgs.model.renderer import Drawable, render
 from vdgs.partition.blocks import Blocks, xy_positions
@@ -143,7 +143,7 @@ class ViewerScene:
 
         def fade_out() -> LodScene:
             least = min(min_visibility, int(self.visibility_sample(name).max()))
-            return tree.with_fade(lambda places: self._nearby.fade_factors(places, least))
+            return tree.with_fade(lambda places: self._nearby.fade_factors(places, least), f"V {least}")
 
         return _keep_last(self._faded_trees, (name, min_visibility), fade_out)
 
@@ -184,14 +184,14 @@ class ViewerScene:
         tree = self.tree(name)
         if tree is None:
             return self.visibility(name)
-        return self._node_values(f"{name} V", self._count_visibility, ("nodes", 0), tree.tree.gaussians(0).means)
+        return self._node_values(
+            f"{name} V", self._count_visibility, ("nodes", 0), lambda: tree.tree.gaussians(0).means
+        )
 
-    def _node_values(
-        self, what: str, of: Callable[[Tensor], Tensor], content: NodeContent, places: Float[Tensor, "p 3"]
-    ) -> Tensor:
+    def _node_values(self, what: str, of: Callable[[Tensor], Tensor], content: NodeContent, places: Places) -> Tensor:
         """Values of the places of a node, each found once."""
         if (what, content) not in self._values:
-            self._values[what, content] = of(places)
+            self._values[what, content] = of(places())
         return self._values[what, content]
 
     def _count_visibility(self, places: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
