@@ -18,13 +18,15 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_splats import merged_splats
-from vdgs.model.lod_tree import LodCut, LodTree, content_bytes
+from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes
 from vdgs.model.renderer import cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
 NodeContent = tuple[str, int]
 #: Reads, or makes, the places of one of these.
 Places = Callable[[], Float[Tensor, "p 3"]]
+#: By what opacities are multiplied is kept up to so many bytes: of many more nodes than the nodes themselves are.
+FACTOR_CACHE_BYTES = 48 << 20
 #: So many of each are kept assembled: those of the last full picture, and those of a preview.
 MAX_ASSEMBLED = 2
 
@@ -51,6 +53,8 @@ class LodScene:
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
     _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
+    #: By what opacities are multiplied, for the Gaussians of what was drawn last, however it fades.
+    _kept_factors: NodeCache = field(default_factory=lambda: NodeCache(FACTOR_CACHE_BYTES))
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -175,10 +179,8 @@ class LodScene:
             is_inside = bool((factors == 1).all())  # as most nodes are: one figure for all their Gaussians
             return factors.new_ones(1).expand(len(factors)) if is_inside else factors
 
-        kind, node = content
-        return self.tree.keep(
-            (f"factors of {kind}, {self.fade_name}", node), counted, lambda f: f.untyped_storage().nbytes()
-        )
+        key = (f"{content[0]}, {self.fade_name}", content[1])
+        return self._kept_factors.get(key, counted, lambda factors: factors.untyped_storage().nbytes())
 
     def _cut(self, camera: Camera) -> LodCut:
         cut = self._cut_of(camera)

@@ -31,7 +31,7 @@ from vdgs.model.lod_format import TREE_FILE
 from vdgs.model.lod_nodes import LodTable, anchors_file, load_anchors, load_node, node_file
 
 #: Nodes, and what scenes make of them, are kept in memory up to so many bytes.
-CACHE_BYTES = 320 << 20
+CACHE_BYTES = 192 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.

@@ -38,7 +38,7 @@ ModelChoice = Literal["coarse", "merged"]
 REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.3, 1.0, 2_000_000
 #: A view at rest is then drawn from all anchors, in parts that show about so many: a part takes about 50 ms on two
 #: cores (measured). Leaves take so much memory meanwhile.
-PART_MAX_ANCHORS, PART_CACHE_BYTES = 20_000, 160 << 20
+PART_MAX_ANCHORS, PART_CACHE_BYTES = 20_000, 128 << 20
 #: Visitors may let a scene fade out at different V: of so many, what has faded is kept (choice).
 _MAX_FADED = 3
 #: Photographs kept in memory, decoded (choice).
