@@ -198,8 +198,8 @@ def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tup
 
 
 def _color_weights(baked: Gaussians, pixels: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """By how much colors count beside the weights of a leaf's Gaussians: what cameras see of it shows in pictures, what
-    lies behind does not, but from elsewhere may. The root is a choice (reports/levels-of-detail.md)."""
+    """By how much colors count beside the weights of a leaf's Gaussians: the root of what cameras see of each, in parts
+    of its weight (choice, reports/levels-of-detail.md). What is hidden from all cameras may show from elsewhere."""
     weights = gaussian_weights(baked)
     seen = pixels * weights.sum() / np.maximum(weights * pixels.sum(), 1e-300)
     return np.clip(np.sqrt(seen), *COLOR_WEIGHTS)
