@@ -28,9 +28,9 @@ def merged_splats(gaussians: NodeGaussians, camera: Camera) -> Splats:
     splats = project_splats(gaussians, camera, gaussians.sh_degree)
     shares = compensated_splats(replace(splats, opacities=torch.ones_like(splats.opacities)), camera, 0.0).opacities
     shown = shown_shares(gaussians, splats.depths, camera)
-    # One layer: what a layer lets through, as a logarithm. 1 - (1 - share) ** covers.
-    layer = gaussians.covers * torch.log1p(-shares)
-    whole, thinned = (splats.opacities * -torch.expm1(layer * part) for part in (1.0, shown))
+    # 1 - (1 - share) ** covers, and with the layers that are left.
+    layers = gaussians.covers * torch.log1p(-shares)
+    whole, thinned = (splats.opacities * -torch.expm1(layers * left) for left in (1.0, shown))
     # What the rasterizer cuts off this splat itself has been counted with its members.
     drawn = torch.minimum(whole, thinned + ALPHA_MIN)
     return replace(splats, opacities=torch.where(shown > 0, drawn, 0))
