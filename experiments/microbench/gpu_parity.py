@@ -19,10 +19,12 @@ from experiments.microbench import step
 from vdgs.kernels import cuda, gsplat
 from vdgs.kernels.gsplat import GsplatUnavailable
 from vdgs.kernels.kernel_types import (
+    SPLAT_TENSORS,
     AdamState,
     AnchorSplats,
     DecoderWeights,
     DensificationStats,
+    MergedGaussians,
     SplatGradients,
     Splats,
 )
@@ -234,6 +236,21 @@ def fade_factors(kernels: KernelBackend, scene: ParityScene) -> Results:
     return {"factors": kernels.fade_factors(scene.anchors.positions, [small] * 3, 2, 0.15)}
 
 
+def merged_splats(kernels: KernelBackend, scene: ParityScene) -> Results:
+    """Of members about as large as the least that is drawn."""
+    a, count = scene.anchors, len(scene.anchors)
+    std = scene.random(count, seed=3).abs()
+    gaussians = MergedGaussians(
+        a.positions, a.log_scales[:, :3], scene.random(count, 4), scene.random(count), scene.random(count, 3),
+        scene.random(count, 3, 3), 1 + scene.random(count).abs(), scene.random(count, seed=2) - 12, std,
+        0.1 * std[:, None] * scene.random(count, 3),
+    )  # fmt: skip
+    splats = kernels.merged_splats(gaussians, scene.camera)
+    drawn = splats.opacities > 0.005
+    values = {name: getattr(splats, name) for name in SPLAT_TENSORS}
+    return {name: torch.where(drawn.view(-1, *[1] * (t.dim() - 1)), t, 0) for name, t in values.items()}
+
+
 def mark_visible(kernels: KernelBackend, scene: ParityScene) -> Results:
     return {"whole marks": kernels.mark_visible(scene.anchors.positions, scene.camera)}
 
@@ -306,9 +323,8 @@ CASES: dict[str, Callable[[KernelBackend, ParityScene], Results]] = {
     for case in (
         adam_rows, adam_tensors, add_view_statistics, cell_centers, cell_keys, contains, count_visibility, cull, decode,
         decode_for_training, decode_backward_adam, fade_factors, fit_harmonics, group_cells, group_max, harmonic_colors,
-        mark_visible,
-        mean_ellipsoids, morton_order, photometric_loss, project, rasterize, rasterize_vjp,
-        splat_contributions,
+        mark_visible, mean_ellipsoids, merged_splats, morton_order, photometric_loss, project, rasterize,
+        rasterize_vjp, splat_contributions,
     )
 }  # fmt: skip
 

@@ -104,6 +104,20 @@ def test_what_is_known_of_members_is_that_of_all_of_them_through_all_levels():
     np.testing.assert_allclose(level.sh0[0].numpy(), wanted, atol=2e-3)
 
 
+def test_how_the_colors_of_members_follow_their_sizes_is_known_through_all_levels():
+    some = random_gaussians(400, 1)
+    weights = gaussian_weights(some)
+    logs = torch.from_numpy(np.log(weights)).float()
+    some = replace(some, sh0=some.sh0 + 0.5 * logs[:, None] * torch.tensor([1.0, 0.0, -1.0]))
+    level = single_members(some)
+    for count in (100, 20, 1):
+        level = merge_by_moments(level, np.arange(len(level)) % count, enlarge=1.0)
+    wanted = np.cov(np.vstack([logs, some.sh0.T]), aweights=weights, ddof=0)[0, 1:]
+    assert wanted[0] > 0.1
+    assert wanted[2] < -0.1
+    np.testing.assert_allclose(level.sh0_log_weight_cov[0].numpy(), wanted, rtol=5e-3, atol=5e-3)
+
+
 def test_flat_gaussians_stay_flat_and_what_has_no_extent_stays_finite():
     some = random_gaussians(60, 0)
     flat = replace(some, log_scales=torch.tensor([[-2.0, -2.0, -40.0]]).repeat(60, 1), means=some.means * 0,

@@ -15,14 +15,13 @@ import torch
 from rich.console import Console
 
 from support.captures import camera_at
-from support.gaussians import random_gaussians
 from support.hand_made_models import camera_above, model_at, opaque_plane
 from vdgs.config.commands import LodRequest
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.export.lod_bake import CameraTable, merge_cells
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
-from vdgs.kernels.constants import ALPHA_MIN, DILATION_PX2
+from vdgs.kernels.torch_ref.merged_splats import shown_members
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.decoder import Decoder
@@ -31,7 +30,7 @@ from vdgs.model.gaussians import Gaussians, NodeGaussians
 from vdgs.model.lod_format import LOD_FORMAT, TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
 from vdgs.model.lod_scene import LodScene
-from vdgs.model.lod_splats import merged_splats, shown_shares
+from vdgs.model.lod_splats import merged_splats
 from vdgs.model.lod_tree import LodTree
 from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
@@ -248,7 +247,8 @@ def test_from_afar_one_gaussian_dims_as_much_as_the_many_that_it_stands_for_and_
     # The many saturate where they are dense, which makes their disk wider than a Gaussian.
     for height, least, most, tolerance in ((10.0, 0.7, 0.9, 0.25), (15.0, 0.5, 0.7, 0.1), (30.0, 0.0, 0.0, 0.0)):
         camera = camera_at(0.0, 0.0, height)
-        assert least <= float(shown_shares(one, torch.tensor([height]), camera)[0]) <= most
+        members = one.log_weight_mean, one.log_weight_std
+        assert least <= float(shown_members(*members, torch.tensor([height]), camera)[0]) <= most
         shown, wanted = (mean_alpha_sum(gaussians, camera) for gaussians in (one, many))
         assert shown == pytest.approx(wanted, rel=tolerance)
 
@@ -261,34 +261,6 @@ def mean_alpha_sum(gaussians: NodeGaussians, camera: Camera) -> float:
         raster = kernels.rasterize(merged_splats(gaussians, moved), torch.zeros(3), camera.width, camera.height)
         sums.append(float(raster.alpha.sum()))
     return float(np.mean(sums))
-
-
-def of_members(log_mean: np.ndarray, log_std: np.ndarray) -> NodeGaussians:
-    """Merged Gaussians whose members have such weights."""
-    chosen = single_members(random_gaussians(len(log_mean), 1))
-    return replace(chosen, log_weight_mean=torch.tensor(log_mean).float(), log_weight_std=torch.tensor(log_std).float())
-
-
-def test_members_too_small_to_be_drawn_show_nothing_in_the_gaussian_that_stands_for_them():
-    """What is left of members of many sizes below `ALPHA_MIN`, by the mean of their drawn shares."""
-    camera, rng = camera_at(0.0, 0.0, 30.0), np.random.default_rng(3)
-    least = ALPHA_MIN * DILATION_PX2 * 30.0**2 / (camera.fx * camera.fy)
-    alone = np.array([0.3, 0.99, 1.5, 4.0, 1e4])
-    weights = least * np.exp(rng.normal(0.4, 1.2, 400_000))
-    for std, mean, wanted in (
-        (np.zeros(5), np.log(least * alone), np.maximum(0, 1 - 1 / alone)),
-        # Weighted by themselves, logarithms that are normally distributed are so with the same deviation.
-        (np.array([1.2]), np.array([np.log(least) + 0.4 + 1.2**2]),
-         [np.average(np.maximum(0, 1 - least / weights), weights=weights)]),
-        (np.array([7.0, 0.0]), np.log(least) + np.array([-300.0, 300.0]), [0.0, 1.0]),
-    ):  # fmt: skip
-        shown = shown_shares(of_members(mean, std), torch.full((len(mean),), 30.0), camera)
-        np.testing.assert_allclose(shown.numpy(), wanted, atol=5e-3)
-    ortho = replace(camera, model="orthographic", fx=camera.fx / 30, fy=camera.fy / 30)
-    few = of_members(np.array([-9.0, -12.0, -15.0]), np.ones(3))
-    torch.testing.assert_close(
-        shown_shares(few, torch.tensor([1.0, 2.0, 3.0]), ortho), shown_shares(few, torch.full((3,), 30.0), camera)
-    )
 
 
 def test_memory_is_bounded_by_what_was_asked_for(scene):

@@ -33,6 +33,8 @@ CAMERAS_PER_LEAF, MAX_CANDIDATES = 8, 64
 MAX_WINDOW_PX = 512
 #: Anchors by which it is told how much of a leaf a camera shows.
 SAMPLES = 128
+#: Steps of k-means by which the Gaussians of cells join (choice, reports/levels-of-detail.md).
+KMEANS_STEPS = 2
 #: Degree of the spherical harmonics of merged Gaussians.
 SH_DEGREE = 1
 #: A leaf's Gaussians are off by at least this part of a cell: they are no anchors, which change with the view.
@@ -95,17 +97,26 @@ def _nearest_means(
     means: Float[np.ndarray, "n 3"], groups: Int[np.ndarray, " n"], large: Bool[np.ndarray, " n"],
     weights: Float[np.ndarray, " n"],
 ) -> Int[np.ndarray, " n"]:  # fmt: skip
-    """The group whose mean is nearest to each, of those of its kind (a step of k-means): borders of cells cut through
-    what belongs together."""
+    """The group whose mean is nearest to each, of those of its kind (`KMEANS_STEPS` of k-means): borders of cells cut
+    through what belongs together."""
     found = np.empty_like(groups)
     for kind in (False, True):
         rows = np.flatnonzero(large == kind)
         if len(rows):
             numbers = np.unique(groups[rows], return_inverse=True)[1]
-            sums = np.stack([np.bincount(numbers, weights[rows] * axis) for axis in means[rows].T], 1)
-            tree = cKDTree(sums / np.bincount(numbers, weights[rows])[:, None])
-            found[rows] = 2 * tree.query(means[rows])[1] + kind
+            for _ in range(KMEANS_STEPS):
+                numbers = _kmeans_step(means[rows], numbers, weights[rows])
+            found[rows] = 2 * numbers + kind
     return np.unique(found, return_inverse=True)[1]
+
+
+def _kmeans_step(
+    means: Float[np.ndarray, "n 3"], groups: Int[np.ndarray, " n"], weights: Float[np.ndarray, " n"]
+) -> Int[np.ndarray, " n"]:
+    """The group whose mean by weight is nearest to each, numbered anew from 0 on; some may be left with none."""
+    sums = np.stack([np.bincount(groups, weights * axis) for axis in means.T], 1)
+    nearest = cKDTree(sums / np.bincount(groups, weights)[:, None]).query(means)[1]
+    return np.unique(nearest, return_inverse=True)[1]
 
 
 def node_record(

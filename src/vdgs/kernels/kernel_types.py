@@ -121,6 +121,22 @@ class Splats:
         return self.means_px, self.conics, self.colors, self.opacities, self.depths
 
 
+class MergedGaussians(NamedTuple):
+    """Gaussians that stand for others, their members (`vdgs.model.gaussians.NodeGaussians`). All but the means may be
+    in half precision."""
+
+    means: Float[Tensor, "m 3"]
+    log_scales: Float[Tensor, "m 3"]
+    quaternions: Float[Tensor, "m 4"]
+    opacity_logits: Float[Tensor, " m"]
+    sh0: Float[Tensor, "m 3"]
+    shN: Float[Tensor, "m r 3"]
+    covers: Float[Tensor, " m"]
+    log_weight_mean: Float[Tensor, " m"]
+    log_weight_std: Float[Tensor, " m"]
+    sh0_log_weight_cov: Float[Tensor, "m 3"]
+
+
 #: The tensors of `Splats` in the order of its fields.
 SPLAT_TENSORS = ("means_px", "conics", "depths", "colors", "opacities")
 

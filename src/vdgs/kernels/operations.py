@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         DecoderWeights,
         DensificationStats,
         IsFinite,
+        MergedGaussians,
         PhotometricLoss,
         ProjectedGaussians,
         Raster,
@@ -64,6 +65,8 @@ class KernelBackend(Protocol):
         gradients: SplatGradients,
         updates: Tensor,
     ) -> tuple[IsFinite, tuple[Tensor, ...] | None]: ...
+
+    def merged_splats(self, gaussians: MergedGaussians, camera: Camera) -> Splats: ...
 
     def project(self, means: Tensor, scales: Tensor, quaternions: Tensor, camera: Camera) -> ProjectedGaussians: ...
 

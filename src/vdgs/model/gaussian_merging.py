@@ -84,6 +84,7 @@ def single_members(gaussians: Gaussians, color_weights: Float[np.ndarray, " n"] 
     return NodeGaussians(
         **gaussians.tensors(), covers=one, log_weight_mean=torch.from_numpy(gaussian_weights(gaussians)).log().float(),
         log_weight_std=0 * one, color_weight=one if color_weights is None else torch.from_numpy(color_weights).float(),
+        sh0_log_weight_cov=torch.zeros_like(gaussians.sh0),
     )  # fmt: skip
 
 
@@ -92,7 +93,12 @@ def _merged_members(gaussians: NodeGaussians, pool: _Pool) -> dict[str, Tensor]:
     mean = pool.mean(gaussians.log_weight_mean)
     apart = gaussians.log_weight_mean.double() - mean[pool.groups]
     std = pool.mean(gaussians.log_weight_std.double() ** 2 + apart**2).sqrt()
-    return {"log_weight_mean": mean, "log_weight_std": std, "color_weight": pool.mean(gaussians.color_weight)}
+    shifted = gaussians.sh0.double() - pool.mean(gaussians.sh0)[pool.groups]
+    cov = pool.mean(gaussians.sh0_log_weight_cov.double() + shifted * apart[:, None])
+    return {
+        "log_weight_mean": mean, "log_weight_std": std, "color_weight": pool.mean(gaussians.color_weight),
+        "sh0_log_weight_cov": cov,
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

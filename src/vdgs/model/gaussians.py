@@ -50,7 +50,8 @@ class Gaussians:
 
     def select(self: AnyGaussians, rows: Tensor) -> AnyGaussians:
         """The Gaussians of the given rows (indices or mask)."""
-        return replace(self, **{name: tensor[rows] for name, tensor in self.tensors().items()})
+        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        return replace(self, **{name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()})
 
     def float(self: AnyGaussians) -> AnyGaussians:
         """The same numbers in float32."""
@@ -83,6 +84,9 @@ class NodeGaussians(Gaussians):
     log_weight_std: Float[Tensor, " n"]
     #: By how much the members' colors count for more, or less, than their weights.
     color_weight: Float[Tensor, " n"]
+    #: Covariance of the members' `sh0` with the logarithms of their weights, each counted by its weight: what the large
+    #: ones look like, which are still drawn from afar.
+    sh0_log_weight_cov: Float[Tensor, "n 3"]
 
 
 @torch.no_grad()

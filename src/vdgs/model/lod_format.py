@@ -7,7 +7,7 @@ from pathlib import Path
 
 TREE_FILE = "tree.safetensors"
 #: Of the table of a tree, and of its nodes: both change together.
-LOD_FORMAT, NODE_FORMAT = "vdgs-lod-4", "vdgs-lod-node-3"
+LOD_FORMAT, NODE_FORMAT = "vdgs-lod-5", "vdgs-lod-node-4"
 
 
 def is_present_format(tree: Path) -> bool:

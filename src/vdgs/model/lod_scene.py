@@ -119,6 +119,8 @@ class LodScene:
             empty = torch.zeros(0, device=self.device)
             wide = empty.new_zeros(0, 3)
             return empty.long(), Splats(empty.new_zeros(0, 2), wide, empty, wide, empty)
+        if len(shown) == 1:
+            return sources[0], shown[0]
         columns = zip(*((s.means_px, s.conics, s.depths, s.colors, s.opacities) for s in shown), strict=True)
         return torch.cat(sources), Splats(*(torch.cat(column) for column in columns))
 
@@ -207,7 +209,7 @@ class LodScene:
     def _assemble_gaussians(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
         """The merged Gaussians of some nodes that are drawn."""
         found = self.tree.gaussians_of(nodes, self._drawn_gaussians)
-        return None if found is None else found.to(self.device).float()
+        return None if found is None else found.to(self.device)
 
     def _drawn_gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node that are drawn, faded."""

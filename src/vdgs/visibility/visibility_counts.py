@@ -64,57 +64,65 @@ class NearbyCameras:
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._cameras = list(cameras)
-        self._poses = np.array([each.camera_from_world for each in cameras]).reshape(-1, 4, 4)
         self._is_pinhole = np.array([each.model == "pinhole" for each in cameras], bool)
+        poses = np.array([each.camera_from_world for each in cameras]).reshape(-1, 4, 4)
         lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras]).reshape(-1, 6).T
         #: Of the pictures widened by `FADE_MARGIN`, and of the pictures; a pixel more and less: no rounding counts.
-        self._widened = _picture_planes(lenses, FADE_MARGIN * np.maximum(*lenses[4:]) + 1)
-        self._planes = _picture_planes(lenses, -1.0)
+        self._widened = _frustum_planes(poses, lenses, FADE_MARGIN * np.maximum(*lenses[4:]) + 1, near=0.0)
+        self._planes = _frustum_planes(poses, lenses, -1.0, near=NEAR_PLANE)
 
     def of(self, positions: Float[Tensor, "p 3"]) -> list[Camera]:
         """Those whose pictures, widened by `FADE_MARGIN`, reach the sphere about these places; others count none."""
-        if not len(positions):
-            return []
-        center, radius = self._sphere(positions)
-        if not np.isfinite(radius):
-            return self._cameras
-        inside = _least_distances(self._widened, center) >= -radius
-        reached = ~self._is_pinhole | (inside & (center[:, 2] >= -radius))
-        return [self._cameras[k] for k in np.flatnonzero(reached)]
+        return self._reached(*_sphere(positions)) if len(positions) else []
 
     def fade_factors(self, positions: Float[Tensor, "p 3"], min_visibility: int) -> Float[Tensor, " p"]:
         """`fade_factors` of all the cameras. Where enough of them hold the whole sphere about the places, or too few
         reach it, none of these is looked at."""
-        if len(near := self.of(positions)) < min_visibility:
-            return positions.new_zeros(len(positions))
-        center, radius = self._sphere(positions)
-        hold = (_least_distances(self._planes, center) > radius) & (center[:, 2] > radius + NEAR_PLANE)
-        if (hold & self._is_pinhole).sum() >= min_visibility:
+        if not len(positions):
+            return positions.new_zeros(0)
+        center, radius = _sphere(positions)
+        if ((_least_distances(self._planes, center) > radius) & self._is_pinhole).sum() >= min_visibility:
             return positions.new_ones(len(positions))
+        if len(near := self._reached(center, radius)) < min_visibility:
+            return positions.new_zeros(len(positions))
         return fade_factors(positions, near, min_visibility)
 
-    def _sphere(self, positions: Float[Tensor, "p 3"]) -> tuple[Float[np.ndarray, "c 3"], float]:
-        """The center of a sphere about some places, from each camera, and its radius."""
-        low, high = (bound.double().cpu().numpy() for bound in torch.aminmax(positions.detach(), dim=0))
-        center = self._poses[:, :3, :3] @ ((low + high) / 2) + self._poses[:, :3, 3]
-        return center, float(np.linalg.norm(high - low)) / 2
+    def _reached(self, center: Float[np.ndarray, "3"], radius: float) -> list[Camera]:
+        if not np.isfinite(radius):
+            return self._cameras
+        reached = ~self._is_pinhole | (_least_distances(self._widened, center) >= -radius)
+        return [self._cameras[k] for k in np.flatnonzero(reached)]
 
 
-def _picture_planes(lenses: Float[np.ndarray, "6 c"], more: Float[np.ndarray, " c"] | float) -> np.ndarray:
-    """Planes [c, 4, 3] through the centers of cameras (fx, fy, cx, cy, width, height) and the edges of their pictures,
-    so many pixels larger on each side: left, right, top, bottom, normals inwards."""
+def _sphere(positions: Float[Tensor, "p 3"]) -> tuple[Float[np.ndarray, "3"], float]:
+    """The center and the radius of a sphere about some places."""
+    low, high = (bound.double().cpu().numpy() for bound in torch.aminmax(positions.detach(), dim=0))
+    return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+
+
+def _frustum_planes(
+    poses: Float[np.ndarray, "c 4 4"], lenses: Float[np.ndarray, "6 c"], more: Float[np.ndarray, " c"] | float,
+    near: float,
+) -> Float[np.ndarray, "c 5 4"]:  # fmt: skip
+    """Planes in the world, unit normals inwards and offsets: so far before each camera, and through its center and the
+    edges of its picture (fx, fy, cx, cy, width, height), so many pixels larger on each side."""
     fx, fy, cx, cy, width, height = lenses
-    zero = np.zeros_like(fx)
-    planes = np.stack([
+    zero, one = np.zeros_like(fx), np.ones_like(fx)
+    normals = np.stack([
+        np.stack([zero, zero, one], -1),
         np.stack([fx, zero, cx + more], -1), np.stack([-fx, zero, width - cx + more], -1),
         np.stack([zero, fy, cy + more], -1), np.stack([zero, -fy, height - cy + more], -1),
     ], 1)  # fmt: skip
-    return planes / np.linalg.norm(planes, axis=2, keepdims=True)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    planes = normals @ poses[:, :3]
+    planes[:, 0, 3] -= near
+    return planes
 
 
-def _least_distances(planes: Float[np.ndarray, "c 4 3"], center: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, " c"]:
-    """How far inside of its planes a place is, from each camera."""
-    return (planes * center[:, None]).sum(2).min(axis=1, initial=np.inf)
+def _least_distances(planes: Float[np.ndarray, "c 5 4"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, " c"]:
+    """How far inside of the frustum of each camera a place is."""
+    distances = planes.reshape(-1, 4) @ np.append(place, 1.0)
+    return distances.reshape(len(planes), -1).min(axis=1, initial=np.inf)
 
 
 def visibility_sampling_weights(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:

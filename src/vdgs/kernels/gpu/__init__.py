@@ -25,5 +25,6 @@ from vdgs.kernels.torch_ref import group_cells as group_cells
 from vdgs.kernels.torch_ref import group_max as group_max
 from vdgs.kernels.torch_ref import harmonic_colors as harmonic_colors
 from vdgs.kernels.torch_ref import mean_ellipsoids as mean_ellipsoids
+from vdgs.kernels.torch_ref import merged_splats as merged_splats
 from vdgs.kernels.torch_ref import morton_order as morton_order
 from vdgs.kernels.torch_ref import project as project

@@ -1,48 +1,22 @@
 // Colors as spherical harmonics: what they show from a place, and their fit to what cameras saw. Sixteen Gaussians are
-// lanes. The functions are those of vdgs.kernels.spherical_harmonics.
+// lanes.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 
 #include "bindings.h"
-#include "simd/simd.h"
+#include "cpu/sh_basis.h"
 #include "threads.h"
 
 namespace vdgs {
 namespace {
 
-constexpr int kMaxDegree = 3;
 constexpr int64_t kTaskGroups = 32;
 // A pivot below this is one of no weight at all: what it would ask for stays 0.
 constexpr double kLeastPivot = 1e-12;
 
-constexpr int functions(int degree) { return (degree + 1) * (degree + 1); }
 // Where element (i, j), j <= i, of a symmetric matrix lies.
 constexpr int packed(int i, int j) { return i * (i + 1) / 2 + j; }
-
-template <int degree>
-VDGS_INLINE void basis(F16 x, F16 y, F16 z, F16* out) {
-  out[0] = splat(0.28209479177387814f);
-  if constexpr (degree >= 1) {
-    const F16 a = splat(-0.4886025119029199f);
-    out[1] = a * y, out[2] = splat(0.4886025119029199f) * z, out[3] = a * x;
-  }
-  const F16 xx = x * x, yy = y * y, zz = z * z;
-  if constexpr (degree >= 2) {
-    const float a = 1.0925484305920792f;
-    out[4] = splat(a) * x * y, out[5] = splat(-a) * y * z;
-    out[6] = splat(0.31539156525252005f) * (splat(3.0f) * zz - splat(1.0f));
-    out[7] = splat(-a) * x * z, out[8] = splat(0.5f * a) * (xx - yy);
-  }
-  if constexpr (degree >= 3) {
-    const float a = 0.5900435899266435f, b = 2.890611442640554f, c = 0.4570457994644658f;
-    const F16 five = splat(5.0f) * zz - splat(1.0f);
-    out[9] = splat(-a) * y * (splat(3.0f) * xx - yy), out[10] = splat(b) * x * y * z, out[11] = splat(-c) * y * five;
-    out[12] = splat(0.3731763325901154f) * z * (splat(5.0f) * zz - splat(3.0f));
-    out[13] = splat(-c) * x * five, out[14] = splat(0.5f * b) * z * (xx - yy);
-    out[15] = splat(-a) * x * (xx - splat(3.0f) * yy);
-  }
-}
 
 // ------------------------------------------------------------------------------------------------ colors
 
@@ -215,12 +189,6 @@ using Matrix = Array<const float, nb::ndim<2>>;
 using Numbers = Array<const int64_t, nb::ndim<1>>;
 // Rows may stand apart from each other.
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::device::cpu>;
-
-template <int degree = 0, class Body>
-void with_degree(int wanted, const Body& body) {
-  if (wanted == degree) return body(std::integral_constant<int, degree>{});
-  if constexpr (degree < kMaxDegree) with_degree<degree + 1>(wanted, body);
-}
 
 void bound_fit(Matrix directions, Matrix colors, Vector weights, Numbers starts, int degree, double ridge,
                Array<float, nb::ndim<2>> found) {

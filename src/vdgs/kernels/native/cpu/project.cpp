@@ -1,5 +1,6 @@
 // Projection of free Gaussians (not spawned by anchors), sixteen at a time.
 #include "bindings.h"
+#include "cpu/rows.h"
 #include "gaussian.h"
 #include "threads.h"
 
@@ -10,24 +11,6 @@ constexpr int64_t kPiece = 4096;
 
 using Rows = Array<const float>;
 using Out = Array<float>;
-
-// Sixteen rows of `width` floats from row `first` on; behind the last row, the last again.
-template <int width>
-VDGS_INLINE void load_columns(const float* rows, int64_t first, int64_t n, F16 (&out)[width]) {
-  alignas(64) float columns[width][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane)
-    for (int i = 0; i < width; ++i) columns[i][lane] = rows[std::min(first + lane, n - 1) * width + i];
-  for (int i = 0; i < width; ++i) out[i] = load(columns[i]);
-}
-
-template <int width>
-VDGS_INLINE void store_columns(float* rows, int64_t first, int64_t n, const F16 (&values)[width]) {
-  alignas(64) float columns[width][kLanes];
-  for (int i = 0; i < width; ++i) store(columns[i], values[i]);
-  const int count = static_cast<int>(std::min<int64_t>(kLanes, n - first));
-  for (int lane = 0; lane < count; ++lane)
-    for (int i = 0; i < width; ++i) rows[(first + lane) * width + i] = columns[i][lane];
-}
 
 struct GaussianRows {
   const float *means, *scales, *quaternions;

@@ -1,0 +1,32 @@
+"""Splats of merged Gaussians in C++, straight from numbers in half precision: sixteen Gaussians side by side."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.arguments import contiguous, packed_camera
+from vdgs.kernels.kernel_types import MergedGaussians, Splats
+from vdgs.kernels.spherical_harmonics import num_sh_bases
+
+
+def merged_splats(gaussians: MergedGaussians, camera: Camera) -> Splats:
+    """As `torch_ref.merged_splats`, in float32. Same bits for any number of threads, and for numbers that are given in
+    half precision or as float32. Raises ValueError for shapes that do not match."""
+    means, *others = gaussians
+    n, degree = len(means), math.isqrt(gaussians.shN.shape[1] + 1) - 1
+    shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, 3), (n, num_sh_bases(degree) - 1, 3), (n,), (n,), (n,), (n, 3)]
+    if [tuple(tensor.shape) for tensor in gaussians] != shapes:
+        raise ValueError(f"merged Gaussians must be {shapes}, not {[tuple(t.shape) for t in gaussians]}")
+    native = extension.get_extension()
+    if all(tensor.dtype == torch.float16 for tensor in others):
+        draw, columns = native.merged_splats_of_halves, [t.contiguous().view(torch.uint16) for t in others]
+    else:
+        draw, columns = native.merged_splats, [contiguous(tensor) for tensor in others]
+    splats = Splats(*(torch.empty(n, *shape) for shape in ((2,), (3,), (), (3,), ())))
+    tensors = (splats.means_px, splats.conics, splats.depths, splats.colors, splats.opacities)
+    draw(contiguous(means), *columns, packed_camera(camera), degree, *tensors)
+    return splats
