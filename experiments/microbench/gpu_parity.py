@@ -245,7 +245,7 @@ def merged_splats(kernels: KernelBackend, scene: ParityScene) -> Results:
         scene.random(count, 3, 3), 1 + scene.random(count).abs(), scene.random(count, seed=2) - 12, std,
         0.1 * std[:, None] * scene.random(count, 3),
     )  # fmt: skip
-    splats = kernels.merged_splats(gaussians, scene.camera)
+    splats = kernels.merged_splats([gaussians], scene.camera)
     drawn = splats.opacities > 0.005
     values = {name: getattr(splats, name) for name in SPLAT_TENSORS}
     return {name: torch.where(drawn.view(-1, *[1] * (t.dim() - 1)), t, 0) for name, t in values.items()}

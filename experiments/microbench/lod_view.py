@@ -26,7 +26,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels import configure_threads
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.lod_scene import LodScene
-from vdgs.model.lod_tree import LodCut
+from vdgs.model.lod_tree import ANCHOR_COST, LodCut
 from vdgs.model.renderer import Drawable, render
 from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.viewer.layers import DisplayOptions, Painter
@@ -161,7 +161,7 @@ def fly(visitor: Visitor, name: str, tree: LodScene, camera: Camera, seconds: fl
     shown = [frame for _, _, frame in visitor.frames[first:] if not frame.is_full]
     pixels = float(np.median([frame.image.shape[0] * frame.image.shape[1] for frame in shown] or [0]))
     small = camera.limit_size(max(1, round(camera.width * np.sqrt(pixels / camera.width / camera.height))))
-    errors = tree.within(small, visitor.session.painter.drawn_anchors * 8 + 1).max_error_px
+    errors = tree.within(small, visitor.session.painter.drawn_anchors * ANCHOR_COST + 1).max_error_px
     print(
         f"{name}: {len(shown) / seconds:.1f} pictures a second in motion ({used / max(len(shown), 1) * 1000:.0f} ms of "
         f"a processor each, {pixels / 1000:.0f} thousand pixels, {errors:.1f} px off at most)",

@@ -43,12 +43,13 @@ def merged(n: int, degree: int, camera: Camera, seed: int = 0) -> MergedGaussian
 @pytest.mark.parametrize(("n", "degree"), [(0, 1), (1, 0), (17, 2), (5000, 1), (3000, 3)])
 def test_the_native_kernel_draws_what_the_twin_does(n: int, degree: int, camera: Camera, instructions: str) -> None:
     gaussians = merged(n, degree, camera)
-    wanted = twin(gaussians._replace(means=gaussians.means.double()), camera)
+    wanted = twin([gaussians._replace(means=gaussians.means.double())], camera)
     with using(instructions):
-        found = native(gaussians, camera)
-        as_floats = native(MergedGaussians(*(tensor.float() for tensor in gaussians)), camera)
+        found = native([gaussians], camera)
+        as_floats = native([MergedGaussians(*(tensor.float() for tensor in gaussians))], camera)
         with on_threads(1):
-            alone = native(gaussians, camera)
+            parts = zip(*(tensor.split([n // 3, n - n // 3]) for tensor in gaussians), strict=True)
+            alone = native([MergedGaussians(*part) for part in parts], camera)
     for name in SPLAT_TENSORS:
         assert torch.equal(getattr(found, name), getattr(as_floats, name))
         assert torch.equal(getattr(found, name), getattr(alone, name))
@@ -67,12 +68,12 @@ def test_halves_become_floats_exactly():
     """Also those below the least normal one, infinity and NaN."""
     every = torch.arange(1 << 16, dtype=torch.int32).to(torch.uint16).view(torch.float16)
     one = merged(len(every), 0, CAMERA)._replace(opacity_logits=every, log_weight_mean=torch.zeros(len(every)).half())
-    as_floats = native(MergedGaussians(*(tensor.float() for tensor in one)), CAMERA)
-    found = native(one, CAMERA)
+    as_floats = native([MergedGaussians(*(tensor.float() for tensor in one))], CAMERA)
+    found = native([one], CAMERA)
     assert torch.equal(found.opacities.view(torch.int32), as_floats.opacities.view(torch.int32))
     # A color is its own coefficient, where nothing else is.
     plain = one._replace(sh0=every[:, None].expand(-1, 3), sh0_log_weight_cov=torch.zeros(len(every), 3).half())
-    shown = native(plain, CAMERA).colors[:, 0]
+    shown = native([plain], CAMERA).colors[:, 0]
     wanted = torch.addcmul(torch.tensor(0.5), torch.tensor(0.28209479177387814), every.float()).clamp_min(0)
     finite = every.isfinite()
     torch.testing.assert_close(shown[finite], wanted[finite], rtol=1e-6, atol=1e-6)
@@ -81,7 +82,7 @@ def test_halves_become_floats_exactly():
 @pytest.mark.parametrize("wrong", [{"covers": torch.ones(5)}, {"shN": torch.zeros(4, 4, 3)}])
 def test_rows_that_do_not_match_are_refused(wrong):
     with pytest.raises(ValueError, match="merged Gaussians must be"):
-        native(merged(4, 1, CAMERA)._replace(**wrong), CAMERA)
+        native([merged(4, 1, CAMERA)._replace(**wrong)], CAMERA)
 
 
 def test_members_too_small_to_be_drawn_show_nothing_in_the_gaussian_that_stands_for_them():
@@ -118,6 +119,6 @@ def test_a_gaussian_has_the_color_of_those_of_its_members_that_are_drawn(above: 
         log_weight_mean=torch.tensor([logs.mean()]), log_weight_std=torch.tensor([std]),
         sh0_log_weight_cov=torch.full((1, 3), cov),
     )  # fmt: skip
-    shown = twin(MergedGaussians(*(tensor.float() for tensor in one)), CAMERA)
+    shown = twin([MergedGaussians(*(tensor.float() for tensor in one))], CAMERA)
     wanted = 0.5 + 0.28209479 * np.average(brightness, weights=drawn)
     np.testing.assert_allclose(shown.colors.numpy(), wanted, atol=1e-3)

@@ -21,6 +21,7 @@ from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.export.lod_bake import CameraTable, merge_cells
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
+from vdgs.kernels.kernel_types import SPLAT_TENSORS
 from vdgs.kernels.torch_ref.merged_splats import shown_members
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decode_world import gaussian_means
@@ -200,9 +201,10 @@ def test_levels_show_the_sky_with_aliasing_and_without(scene):
 def test_nodes_are_kept_as_they_were_saved_and_drawn_in_float32(scene):
     kept = scene.tree.gaussians(0)
     assert {name for name, tensor in kept.tensors().items() if tensor.dtype == torch.float32} == {"means"}
-    drawn = scene.at_error(1e6)._assemble_gaussians((0,))
-    for name, tensor in kept.tensors().items():
-        assert torch.equal(drawn.tensors()[name], tensor.float())
+    _, drawn = scene.at_error(1e6).view_splats(VIEWS[0])
+    wanted = merged_splats([kept.float()], VIEWS[0])
+    for name in SPLAT_TENSORS:
+        assert torch.equal(getattr(drawn, name), getattr(wanted, name))
 
 
 def test_merging_cells_keeps_what_it_merges(scene):
@@ -242,7 +244,7 @@ def test_from_afar_one_gaussian_dims_as_much_as_the_many_that_it_stands_for_and_
     ))  # fmt: skip
     one = merge_by_moments(many, np.zeros(100, np.int64), enlarge=1.0)
     assert one.covers[0] > 10
-    near = merged_splats(one, camera_at(0.0, 0.0, 0.1)).opacities
+    near = merged_splats([one], camera_at(0.0, 0.0, 0.1)).opacities
     assert 0.99 < float(near[0]) <= 0.999 + 1e-6
     # The many saturate where they are dense, which makes their disk wider than a Gaussian.
     for height, least, most, tolerance in ((10.0, 0.7, 0.9, 0.25), (15.0, 0.5, 0.7, 0.1), (30.0, 0.0, 0.0, 0.0)):
@@ -258,7 +260,7 @@ def mean_alpha_sum(gaussians: NodeGaussians, camera: Camera) -> float:
     kernels, sums = get_backend(torch.device("cpu")), list[float]()
     for x, y in product(np.arange(4) / 4, repeat=2):
         moved = replace(camera, cx=camera.cx + x, cy=camera.cy + y)
-        raster = kernels.rasterize(merged_splats(gaussians, moved), torch.zeros(3), camera.width, camera.height)
+        raster = kernels.rasterize(merged_splats([gaussians], moved), torch.zeros(3), camera.width, camera.height)
         sums.append(float(raster.alpha.sum()))
     return float(np.mean(sums))
 

@@ -18,7 +18,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_splats import merged_splats
-from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes
+from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes, side_by_side
 from vdgs.model.renderer import cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
@@ -52,7 +52,7 @@ class LodScene:
     #: beside a small part of a view.
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
-    _gaussians: dict[tuple[int, ...], NodeGaussians | None] = field(default_factory=dict)
+    _gaussians: dict[tuple[int, ...], list[NodeGaussians]] = field(default_factory=dict)
     #: By what opacities are multiplied, for the Gaussians of what was drawn last, however it fades.
     _kept_factors: NodeCache = field(default_factory=lambda: NodeCache(FACTOR_CACHE_BYTES))
 
@@ -111,10 +111,11 @@ class LodScene:
             sources.append(rows)
             shown.append(splats)
             first = len(anchors.anchors)
-        gaussians = _held(self._gaussians, cut.nodes, self._assemble_gaussians)
-        if gaussians is not None:
-            sources.append(torch.arange(first, first + len(gaussians), device=self.device))
-            shown.append(merged_splats(gaussians, camera))
+        if cut.nodes:
+            nodes = _held(self._gaussians, cut.nodes, self._read_gaussians)
+            splats = merged_splats(nodes, camera)
+            sources.append(torch.arange(first, first + len(splats.depths), device=self.device))
+            shown.append(splats)
         if not shown:
             empty = torch.zeros(0, device=self.device)
             wide = empty.new_zeros(0, 3)
@@ -206,10 +207,9 @@ class LodScene:
             anchors = replace(anchors, opacity_factors=factors)
         return (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
 
-    def _assemble_gaussians(self, nodes: tuple[int, ...]) -> NodeGaussians | None:
-        """The merged Gaussians of some nodes that are drawn."""
-        found = self.tree.gaussians_of(nodes, self._drawn_gaussians)
-        return None if found is None else found.to(self.device)
+    def _read_gaussians(self, nodes: tuple[int, ...]) -> list[NodeGaussians]:
+        """The merged Gaussians of some nodes that are drawn, node by node."""
+        return [gaussians.to(self.device) for gaussians in side_by_side(self._drawn_gaussians, nodes)]
 
     def _drawn_gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node that are drawn, faded."""

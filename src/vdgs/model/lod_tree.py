@@ -34,8 +34,8 @@ from vdgs.model.lod_nodes import LodTable, anchors_file, load_anchors, load_node
 CACHE_BYTES = 192 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25
-#: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten.
-ANCHOR_COST = 8
+#: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten (measured).
+ANCHOR_COST = 16
 #: Beyond so many threads reading nodes would take more memory, not less time.
 MAX_READERS = 4
 #: Parts of a view in full detail: places of a leaf's box each way, pixels that count as an anchor, the least size.
@@ -172,23 +172,18 @@ class LodTree:
         file = anchors_file(self.folder, leaf)
         return self.keep(("anchors", leaf), lambda: load_anchors(file), lambda content: content_bytes(content[0]))
 
-    def gaussians_of(self, nodes: tuple[int, ...], drawn: Callable[[int], NodeGaussians]) -> NodeGaussians | None:
-        """The merged Gaussians of some nodes, one after another; of each node those of `drawn`."""
-        parts = _side_by_side(drawn, nodes)
-        return _joined(NodeGaussians, parts) if parts else None
-
     def anchors_of(
         self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]
     ) -> tuple[Anchors, Tensor] | None:
         """The anchors of some leaves in the order of the model, and their rows there; of each leaf those of `drawn`."""
-        parts = _side_by_side(drawn, leaves)
+        parts = side_by_side(drawn, leaves)
         if not parts:
             return None
         rows, order = torch.cat([rows for _, rows in parts]).sort()
         return _joined(Anchors, [anchors for anchors, _ in parts]).select(order), rows
 
 
-def _side_by_side(drawn: Callable[[int], _Content], nodes: tuple[int, ...]) -> list[_Content]:
+def side_by_side(drawn: Callable[[int], _Content], nodes: tuple[int, ...]) -> list[_Content]:
     """What some nodes draw, in their order: they are read, checked and faded on as many threads as kernels use."""
     if (workers := min(get_num_threads(), MAX_READERS, len(nodes))) <= 1:
         return [drawn(node) for node in nodes]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
+from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
@@ -13,20 +16,28 @@ from vdgs.kernels.kernel_types import MergedGaussians, Splats
 from vdgs.kernels.spherical_harmonics import num_sh_bases
 
 
-def merged_splats(gaussians: MergedGaussians, camera: Camera) -> Splats:
+def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
     """As `torch_ref.merged_splats`, in float32. Same bits for any number of threads, and for numbers that are given in
     half precision or as float32. Raises ValueError for shapes that do not match."""
-    means, *others = gaussians
-    n, degree = len(means), math.isqrt(gaussians.shN.shape[1] + 1) - 1
+    ends = [0, *accumulate(len(part.means) for part in parts)]
+    splats = Splats(*(torch.empty(ends[-1], *shape) for shape in ((2,), (3,), (), (3,), ())))
+    tensors = (splats.means_px, splats.conics, splats.depths, splats.colors, splats.opacities)
+    packed = packed_camera(camera)
+    for part, first, end in zip(parts, ends, ends[1:], strict=False):
+        _draw(part, packed, [tensor[first:end] for tensor in tensors])
+    return splats
+
+
+def _draw(part: MergedGaussians, camera: Tensor, tensors: list[Tensor]) -> None:
+    """The splats of a part, into these tensors."""
+    means, *others = part
+    n, degree = len(means), math.isqrt(part.shN.shape[1] + 1) - 1
     shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, 3), (n, num_sh_bases(degree) - 1, 3), (n,), (n,), (n,), (n, 3)]
-    if [tuple(tensor.shape) for tensor in gaussians] != shapes:
-        raise ValueError(f"merged Gaussians must be {shapes}, not {[tuple(t.shape) for t in gaussians]}")
+    if [tuple(tensor.shape) for tensor in part] != shapes:
+        raise ValueError(f"merged Gaussians must be {shapes}, not {[tuple(t.shape) for t in part]}")
     native = extension.get_extension()
     if all(tensor.dtype == torch.float16 for tensor in others):
         draw, columns = native.merged_splats_of_halves, [t.contiguous().view(torch.uint16) for t in others]
     else:
         draw, columns = native.merged_splats, [contiguous(tensor) for tensor in others]
-    splats = Splats(*(torch.empty(n, *shape) for shape in ((2,), (3,), (), (3,), ())))
-    tensors = (splats.means_px, splats.conics, splats.depths, splats.colors, splats.opacities)
-    draw(contiguous(means), *columns, packed_camera(camera), degree, *tensors)
-    return splats
+    draw(contiguous(means), *columns, camera, degree, *tensors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -24,15 +25,15 @@ MAX_STDS = 6.0
 LEAST_WEIGHT = 1e-30
 
 
-def merged_splats(gaussians: MergedGaussians, camera: Camera) -> Splats:
-    """The splats of merged Gaussians in a view, without aliasing; opacity 0 where none is to be drawn.
+def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
+    """The splats of merged Gaussians in a view, part after part, without aliasing; opacity 0 where none is to be drawn.
 
     A splat is as much more transparent as the blur of a pixel enlarges it (Mip-Splatting, eq. 9): the blur that a model
     has learnt is part of its merged Gaussians. One that covers several times as much as itself is drawn as so many
     behind each other; members that are too small to be drawn are not among these (`shown_members`), and its color is
     that of the others. Numbers in half precision are taken in the precision of the means. Not differentiable.
     """
-    g = MergedGaussians(*(tensor.to(gaussians.means.dtype) for tensor in gaussians))
+    g = MergedGaussians(*(torch.cat(column).to(parts[0].means.dtype) for column in zip(*parts, strict=True)))
     degree = math.isqrt(g.shN.shape[1] + 1) - 1
     found = project_gaussians(g.means, GaussianShapes(g.log_scales.exp(), g.quaternions), camera)
     seen, shares = found.projected, found.compensation
