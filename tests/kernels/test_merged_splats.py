@@ -29,11 +29,13 @@ def merged(n: int, degree: int, camera: Camera, seed: int = 0) -> MergedGaussian
     depths = camera.project(some.means.numpy())[1] if camera.model == "pinhole" else np.ones(n)
     least = ALPHA_MIN * DILATION_PX2 / (camera.fx * camera.fy) * np.clip(np.abs(depths), 0.1, None) ** 2
     std = 3 * torch.rand(n, generator=g) ** 3
+    factors = (1.5 * torch.rand(n, generator=g)).clamp(max=1)
+    factors[32:64] = 0
     of_members = MergedGaussians(
         some.means, some.log_scales - 2, some.quaternions, some.opacity_logits, some.sh0, some.shN,
         covers=1 + 20 * torch.rand(n, generator=g) ** 4,
         log_weight_mean=torch.from_numpy(np.log(least)).float() + 3 * torch.randn(n, generator=g), log_weight_std=std,
-        sh0_log_weight_cov=std[:, None] * torch.randn(n, 3, generator=g) * 0.2,
+        sh0_log_weight_cov=std[:, None] * torch.randn(n, 3, generator=g) * 0.2, opacity_factors=factors,
     )  # fmt: skip
     return of_members._replace(**{name: t.half() for name, t in of_members._asdict().items() if name != "means"})
 
@@ -67,7 +69,8 @@ def test_the_native_kernel_draws_what_the_twin_does(n: int, degree: int, camera:
 def test_halves_become_floats_exactly():
     """Also those below the least normal one, infinity and NaN."""
     every = torch.arange(1 << 16, dtype=torch.int32).to(torch.uint16).view(torch.float16)
-    one = merged(len(every), 0, CAMERA)._replace(opacity_logits=every, log_weight_mean=torch.zeros(len(every)).half())
+    ones, zeros = torch.ones(len(every)).half(), torch.zeros(len(every)).half()
+    one = merged(len(every), 0, CAMERA)._replace(opacity_logits=every, log_weight_mean=zeros, opacity_factors=ones)
     as_floats = native([MergedGaussians(*(tensor.float() for tensor in one))], CAMERA)
     found = native([one], CAMERA)
     assert torch.equal(found.opacities.view(torch.int32), as_floats.opacities.view(torch.int32))
@@ -79,7 +82,18 @@ def test_halves_become_floats_exactly():
     torch.testing.assert_close(shown[finite], wanted[finite], rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("wrong", [{"covers": torch.ones(5)}, {"shN": torch.zeros(4, 4, 3)}])
+def test_what_fades_nowhere_is_drawn_as_with_factors_of_one():
+    gaussians = merged(200, 1, CAMERA)
+    ones = gaussians._replace(opacity_factors=torch.ones(200).half())
+    none = ones._replace(opacity_factors=None)
+    for draw in (native, twin):
+        for name in SPLAT_TENSORS:
+            assert torch.equal(*(getattr(draw([each], CAMERA), name) for each in (none, ones)))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"opacity_factors": torch.ones(3)}, {"covers": torch.ones(5)}, {"shN": torch.zeros(4, 4, 3)}]
+)
 def test_rows_that_do_not_match_are_refused(wrong):
     with pytest.raises(ValueError, match="merged Gaussians must be"):
         native([merged(4, 1, CAMERA)._replace(**wrong)], CAMERA)
@@ -119,6 +133,6 @@ def test_a_gaussian_has_the_color_of_those_of_its_members_that_are_drawn(above: 
         log_weight_mean=torch.tensor([logs.mean()]), log_weight_std=torch.tensor([std]),
         sh0_log_weight_cov=torch.full((1, 3), cov),
     )  # fmt: skip
-    shown = twin([MergedGaussians(*(tensor.float() for tensor in one))], CAMERA)
+    shown = twin([MergedGaussians(*(tensor if tensor is None else tensor.float() for tensor in one))], CAMERA)
     wanted = 0.5 + 0.28209479 * np.average(brightness, weights=drawn)
     np.testing.assert_allclose(shown.colors.numpy(), wanted, atol=1e-3)

@@ -135,6 +135,8 @@ class MergedGaussians(NamedTuple):
     log_weight_mean: Float[Tensor, " m"]
     log_weight_std: Float[Tensor, " m"]
     sh0_log_weight_cov: Float[Tensor, "m 3"]
+    #: What opacities, those of the members too, are multiplied with; None: nothing.
+    opacity_factors: Float[Tensor, " m"] | None = None
 
 
 #: The tensors of `Splats` in the order of its fields.

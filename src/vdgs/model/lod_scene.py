@@ -16,9 +16,8 @@ from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decode_world import gaussian_means
-from vdgs.model.gaussians import NodeGaussians
-from vdgs.model.lod_splats import merged_splats
-from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, content_bytes, side_by_side
+from vdgs.model.lod_splats import FadedNode, merged_splats
+from vdgs.model.lod_tree import LodCut, LodTree, NodeCache, side_by_side
 from vdgs.model.renderer import cull_anchors, view_splats, without_aliasing
 
 #: What a node draws: its merged Gaussians ("nodes"), or the anchors of a leaf ("anchors").
@@ -52,7 +51,7 @@ class LodScene:
     #: beside a small part of a view.
     culls_leaves: bool = False
     _anchors: dict[tuple[int, ...], AnchorModel | None] = field(default_factory=dict)
-    _gaussians: dict[tuple[int, ...], list[NodeGaussians]] = field(default_factory=dict)
+    _nodes: dict[tuple[int, ...], list[FadedNode]] = field(default_factory=dict)
     #: By what opacities are multiplied, for the Gaussians of what was drawn last, however it fades.
     _kept_factors: NodeCache = field(default_factory=lambda: NodeCache(FACTOR_CACHE_BYTES))
 
@@ -79,7 +78,7 @@ class LodScene:
     def in_detail(self, tree: LodTree) -> LodScene:
         """The same scene drawn from all anchors, for small parts of views, through its tree with memory of its own
         (`LodTree.with_own_cache`): what this one keeps stays there."""
-        return replace(self, tree=tree, max_error_px=0.0, view=None, culls_leaves=True, _anchors={}, _gaussians={})
+        return replace(self, tree=tree, max_error_px=0.0, view=None, culls_leaves=True, _anchors={}, _nodes={})
 
     def for_view(self, view: Camera) -> LodScene:
         """The same scene for pictures of parts of a view, one after another."""
@@ -92,7 +91,7 @@ class LodScene:
     def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]], name: str) -> LodScene:
         """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other. The tree
         keeps what it has faded by `name`."""
-        return replace(self, fade=factors, fade_name=name, _anchors={}, _gaussians={})
+        return replace(self, fade=factors, fade_name=name, _anchors={}, _nodes={})
 
     def cost(self, camera: Camera) -> int:
         """What a view costs, in merged Gaussians."""
@@ -111,8 +110,8 @@ class LodScene:
             sources.append(rows)
             shown.append(splats)
             first = len(anchors.anchors)
-        if cut.nodes:
-            nodes = _held(self._gaussians, cut.nodes, self._read_gaussians)
+        nodes = _held(self._nodes, cut.nodes, self._read_nodes)
+        if nodes:
             splats = merged_splats(nodes, camera)
             sources.append(torch.arange(first, first + len(splats.depths), device=self.device))
             shown.append(splats)
@@ -136,14 +135,13 @@ class LodScene:
         return torch.cat(found) if found else torch.zeros(0)
 
     def _node_values(self, node: int, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
-        """Values of the merged Gaussians of a node that are drawn."""
-        values = of(("nodes", node), partial(self._node_places, node))
-        factors = self._factors(("nodes", node), partial(self._node_places, node))
-        return values if factors is None else values[factors > 0]
+        """Values of the merged Gaussians of a node, none where all have faded out."""
+        values = of(("nodes", node), lambda: self.tree.gaussians(node).means)
+        return values[:0] if _are_zero(self._node_factors(node)) else values
 
-    def _node_places(self, node: int) -> Float[Tensor, "m 3"]:
-        """Where the merged Gaussians of a node lie. Of a scene that fades only what is drawn is kept in memory."""
-        return (self.tree.gaussians(node) if self.fade is None else self.tree.load(node)).means
+    def _node_factors(self, node: int) -> Float[Tensor, " m"] | None:
+        """What the opacities of the merged Gaussians of a node are multiplied with; None: nothing."""
+        return self._factors(("nodes", node), lambda: self.tree.gaussians(node).means)
 
     def _leaf_values(
         self, leaves: tuple[int, ...], camera: Camera, of: Callable[[NodeContent, Places], Tensor]
@@ -159,9 +157,12 @@ class LodScene:
         return torch.cat(found)[torch.cat(rows).argsort()]
 
     def _leaf_factors(self, leaf: int, anchors: Anchors) -> Float[Tensor, "a k"] | None:
-        """What the opacities of the Gaussians of a leaf's anchors are multiplied with; None: nothing."""
+        """What the opacities of the Gaussians of a leaf's anchors are multiplied with; None: no scene that fades."""
+        if self.fade is None:
+            return None
         found = self._factors(("anchors", leaf), lambda: gaussian_means(anchors).flatten(0, 1))
-        return None if found is None else found.view(anchors.offsets.shape[:2])
+        shape = anchors.offsets.shape[:2]
+        return torch.ones(1, dtype=torch.half).expand(shape) if found is None else found.view(shape)
 
     def _leaf_mask(self, anchors: Anchors, factors: Tensor | None, camera: Camera) -> Tensor | None:
         """Which anchors of a leaf are put together for a view; None: all."""
@@ -173,17 +174,16 @@ class LodScene:
         return mask
 
     def _factors(self, content: NodeContent, places: Places) -> Float[Tensor, " p"] | None:
-        """`fade` of the places of a node; what was asked for lately is kept."""
+        """`fade` of the places of a node, None where it is 1 everywhere; what was asked for lately is kept."""
         if (fade := self.fade) is None:
             return None
 
-        def counted() -> Tensor:
+        def counted() -> Tensor | None:
             factors = fade(places()).half()
-            is_inside = bool((factors == 1).all())  # as most nodes are: one figure for all their Gaussians
-            return factors.new_ones(1).expand(len(factors)) if is_inside else factors
+            return None if (factors == 1).all() else factors
 
         key = (f"{content[0]}, {self.fade_name}", content[1])
-        return self._kept_factors.get(key, counted, lambda factors: factors.untyped_storage().nbytes())
+        return self._kept_factors.get(key, counted, lambda factors: 0 if factors is None else factors.nbytes)
 
     def _cut(self, camera: Camera) -> LodCut:
         cut = self._cut_of(camera)
@@ -207,29 +207,14 @@ class LodScene:
             anchors = replace(anchors, opacity_factors=factors)
         return (anchors, rows) if mask is None else (anchors.select(mask), rows[mask])
 
-    def _read_gaussians(self, nodes: tuple[int, ...]) -> list[NodeGaussians]:
-        """The merged Gaussians of some nodes that are drawn, node by node."""
-        return [gaussians.to(self.device) for gaussians in side_by_side(self._drawn_gaussians, nodes)]
+    def _read_nodes(self, nodes: tuple[int, ...]) -> list[FadedNode]:
+        """The nodes of which something is drawn."""
+        read = side_by_side(lambda node: FadedNode(self.tree.gaussians(node), self._node_factors(node)), nodes)
+        return [node.to(self.device) for node in read if not _are_zero(node.factors)]
 
-    def _drawn_gaussians(self, node: int) -> NodeGaussians:
-        """The merged Gaussians of a node that are drawn, faded."""
-        if self.fade is None:
-            return self.tree.gaussians(node)
-        return self.tree.keep((f"nodes, {self.fade_name}", node), partial(self._faded_gaussians, node), content_bytes)
 
-    def _faded_gaussians(self, node: int) -> NodeGaussians:
-        gaussians = self.tree.load(node)
-        factors = self._factors(("nodes", node), lambda: gaussians.means)
-        if factors is None or not len((factors < 1).nonzero()):
-            return gaussians
-        drawn = factors.nonzero()[:, 0]
-        gaussians, factors = gaussians.select(drawn), factors[drawn]
-        logits = gaussians.opacity_logits.float()
-        faded = torch.where(factors < 1, (logits.sigmoid() * factors).logit(), logits)
-        # Members fade as the Gaussian does that stands for them.
-        weights = gaussians.log_weight_mean.float() + factors.float().log()
-        half = gaussians.opacity_logits.dtype
-        return replace(gaussians, opacity_logits=faded.to(half), log_weight_mean=weights.to(half))
+def _are_zero(factors: Tensor | None) -> bool:
+    return factors is not None and not factors.any()
 
 
 _Held = TypeVar("_Held")

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
@@ -10,8 +15,23 @@ from vdgs.kernels.kernel_types import MergedGaussians, Splats
 from vdgs.model.gaussians import NodeGaussians
 
 
-def merged_splats(nodes: Sequence[NodeGaussians], camera: Camera) -> Splats:
-    """The splats of the merged Gaussians of some nodes in a view, node after node, at least one node
+class FadedNode(NamedTuple):
+    """The merged Gaussians of a node, and what their opacities are multiplied with; None: nothing."""
+
+    gaussians: NodeGaussians
+    factors: Float[Tensor, " n"] | None = None
+
+    def to(self, device: torch.device) -> FadedNode:
+        """The same node on a device; the same tensors where they are on it."""
+        return FadedNode(self.gaussians.to(device), None if self.factors is None else self.factors.to(device))
+
+    def part(self) -> MergedGaussians:
+        """What the kernels draw."""
+        columns = {name: getattr(self.gaussians, name) for name in MergedGaussians._fields[:-1]}
+        return MergedGaussians(**columns, opacity_factors=self.factors)
+
+
+def merged_splats(nodes: Sequence[FadedNode], camera: Camera) -> Splats:
+    """The splats of the merged Gaussians of some nodes, at least one, in a view, node after node
     (`kernels.torch_ref.merged_splats`)."""
-    parts = [MergedGaussians(*(getattr(node, name) for name in MergedGaussians._fields)) for node in nodes]
-    return get_backend(nodes[0].means.device).merged_splats(parts, camera)
+    return get_backend(nodes[0].gaussians.means.device).merged_splats([node.part() for node in nodes], camera)

@@ -30,14 +30,16 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
 
 def _draw(part: MergedGaussians, camera: Tensor, tensors: list[Tensor]) -> None:
     """The splats of a part, into these tensors."""
-    means, *others = part
+    means, others = part.means, part[1:-1]
+    factors = part.covers[:0] if part.opacity_factors is None else part.opacity_factors
     n, degree = len(means), math.isqrt(part.shN.shape[1] + 1) - 1
     shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, 3), (n, num_sh_bases(degree) - 1, 3), (n,), (n,), (n,), (n, 3)]
-    if [tuple(tensor.shape) for tensor in part] != shapes:
-        raise ValueError(f"merged Gaussians must be {shapes}, not {[tuple(t.shape) for t in part]}")
-    native = extension.get_extension()
-    if all(tensor.dtype == torch.float16 for tensor in others):
-        draw, columns = native.merged_splats_of_halves, [t.contiguous().view(torch.uint16) for t in others]
+    found = [tuple(tensor.shape) for tensor in (means, *others)]
+    if found != shapes or len(factors) not in (0, n):
+        raise ValueError(f"merged Gaussians must be {shapes}, not {found}, with {n} factors or none")
+    native, columns = extension.get_extension(), [*others, factors]
+    if all(tensor.dtype == torch.float16 for tensor in columns):
+        draw, columns = native.merged_splats_of_halves, [t.contiguous().view(torch.uint16) for t in columns]
     else:
-        draw, columns = native.merged_splats, [contiguous(tensor) for tensor in others]
+        draw, columns = native.merged_splats, [contiguous(tensor) for tensor in columns]
     draw(contiguous(means), *columns, camera, degree, *tensors)

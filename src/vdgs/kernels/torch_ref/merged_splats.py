@@ -33,18 +33,29 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
     behind each other; members that are too small to be drawn are not among these (`shown_members`), and its color is
     that of the others. Numbers in half precision are taken in the precision of the means. Not differentiable.
     """
-    g = MergedGaussians(*(torch.cat(column).to(parts[0].means.dtype) for column in zip(*parts, strict=True)))
+    g = _joined(parts)
     degree = math.isqrt(g.shN.shape[1] + 1) - 1
     found = project_gaussians(g.means, GaussianShapes(g.log_scales.exp(), g.quaternions), camera)
     seen, shares = found.projected, found.compensation
-    shown, larger = shown_members(g.log_weight_mean, g.log_weight_std, seen.depths, camera)
+    # Members fade as the Gaussian does that stands for them.
+    assert g.opacity_factors is not None
+    faded = g.log_weight_mean + g.opacity_factors.clamp_min(LEAST_WEIGHT).log()
+    shown, larger = shown_members(faded, g.log_weight_std, seen.depths, camera)
     colors = eval_sh_colors(g.sh0 + larger[:, None] * g.sh0_log_weight_cov, g.shN, _directions(g.means, camera), degree)
     # 1 - (1 - share) ** covers, and with the layers that are left.
     layers = g.covers * torch.log1p(-shares)
-    whole, thinned = (g.opacity_logits.sigmoid() * -torch.expm1(layers * left) for left in (1.0, shown))
+    opacities = g.opacity_factors * g.opacity_logits.sigmoid()
+    whole, thinned = (opacities * -torch.expm1(layers * left) for left in (1.0, shown))
     # What the rasterizer cuts off this splat itself has been counted with its members.
     drawn = torch.minimum(whole, thinned + ALPHA_MIN)
     return Splats(seen.means_px, seen.conics, seen.depths, colors, torch.where(seen.valid & (shown > 0), drawn, 0))
+
+
+def _joined(parts: Sequence[MergedGaussians]) -> MergedGaussians:
+    """All parts together, in the precision of their means, with factors."""
+    ones = torch.ones_like
+    whole = [p if p.opacity_factors is not None else p._replace(opacity_factors=ones(p.covers)) for p in parts]
+    return MergedGaussians(*(torch.cat(column).to(parts[0].means.dtype) for column in zip(*whole, strict=True)))  # type: ignore[type-var]
 
 
 def _directions(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:

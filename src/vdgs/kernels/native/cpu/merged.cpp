@@ -19,6 +19,7 @@ template <class Number>
 struct MergedRows {
   const float* means;
   const Number *log_scales, *quaternions, *opacity_logits, *sh0, *sh_rest, *covers, *weight_mean, *weight_std, *cov;
+  const Number* factors;  // of the opacities; null: all 1
   int64_t count;
 };
 
@@ -111,9 +112,18 @@ VDGS_INLINE void colors_of(const MergedRows<Number>& rows, int64_t first, const 
   for (int c = 0; c < 3; ++c) color[c] = max(color[c], splat(0.0f));
 }
 
+void clear_sixteen(int64_t first, int64_t n, const SplatRows& out) {
+  const int64_t count = std::min<int64_t>(kLanes, n - first);
+  const auto clear = [&](float* rows, int64_t width) { std::fill_n(rows + first * width, count * width, 0.0f); };
+  clear(out.means_px, 2), clear(out.conics, 3), clear(out.depths, 1), clear(out.colors, 3), clear(out.opacities, 1);
+}
+
 template <int degree, class Number>
 void draw_sixteen(const MergedRows<Number>& rows, const Camera& camera, int64_t first, const SplatRows& out) {
   const int64_t n = rows.count;
+  F16 factor[1] = {splat(1.0f)};
+  if (rows.factors) load_columns(rows.factors, first, n, factor);
+  if (none(gt(factor[0], splat(0.0f)))) return clear_sixteen(first, n, out);
   F16 m[3], s[3], q[4], logit[1], covers[1], weight_mean[1], weight_std[1], color[3];
   load_columns(rows.means, first, n, m);
   load_columns(rows.log_scales, first, n, s);
@@ -127,9 +137,11 @@ void draw_sixteen(const MergedRows<Number>& rows, const Camera& camera, int64_t 
   const F16 share = sqrt(clamp(dot(p.area, p.area) * p.inverse_determinant, 0.0f, 1.0f));
   const F16 pixels = camera.orthographic ? splat(1.0f) : p.local.z * p.local.z;
   const F16 least = splat(kAlphaMin * kDilationPx2 / (camera.fx * camera.fy)) * pixels;
-  const Shown shown = shown_members(weight_mean[0], weight_std[0], log(max(least, splat(kLeastWeight))));
+  // Members fade as the Gaussian does that stands for them.
+  const F16 faded = weight_mean[0] + log(max(factor[0], splat(kLeastWeight)));
+  const Shown shown = shown_members(faded, weight_std[0], log(max(least, splat(kLeastWeight))));
   colors_of<degree>(rows, first, camera, gaussian.mean, shown.larger, color);
-  const F16 layers = covers[0] * depth_of(share), opacity = sigmoid(logit[0]);
+  const F16 layers = covers[0] * depth_of(share), opacity = factor[0] * sigmoid(logit[0]);
   const F16 drawn = min(opacity * opacity_of(layers), fma(opacity, opacity_of(layers * shown.share), splat(kAlphaMin)));
 
   const auto if_valid = [&](F16 a) { return zero_unless(p.valid, a); };
@@ -161,11 +173,13 @@ using Out = Array<float>;
 template <class Numbers, class Number>
 void bound(const Floats& means, const Numbers& log_scales, const Numbers& quaternions, const Numbers& opacity_logits,
            const Numbers& sh0, const Numbers& sh_rest, const Numbers& covers, const Numbers& weight_mean,
-           const Numbers& weight_std, const Numbers& cov, const Floats& camera, int degree, const Out& means_px, const Out& conics,
+           const Numbers& weight_std, const Numbers& cov, const Numbers& factors,
+           const Floats& camera, int degree, const Out& means_px, const Out& conics,
            const Out& depths, const Out& colors, const Out& opacities) {
   const auto of = [](const Numbers& array) { return reinterpret_cast<const Number*>(array.data()); };
   const MergedRows<Number> rows = {means.data(), of(log_scales), of(quaternions), of(opacity_logits), of(sh0),
                                    of(sh_rest), of(covers), of(weight_mean), of(weight_std), of(cov),
+                                   factors.shape(0) ? of(factors) : nullptr,
                                    static_cast<int64_t>(means.shape(0))};
   draw(rows, camera, degree,
        {means_px.data(), conics.data(), depths.data(), colors.data(), opacities.data()});
