@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from vdgs.captures.camera_height import pixel_at_camera_height
 from vdgs.export.bake import BakeViews, fit_gaussians, gaussian_count, view_contributions
 from vdgs.geometry.camera import Camera
+from vdgs.kernels import get_backend
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussian_merging import gaussian_weights, merge_by_moments, single_members
@@ -29,6 +30,9 @@ from vdgs.model.lod_nodes import NodeRecord
 CELLS_PER_EDGE = 64
 #: Training cameras that a leaf is baked from, and of how many of the nearest they are chosen.
 CAMERAS_PER_LEAF, MAX_CANDIDATES = 8, 64
+#: And from so many views all around it that nobody photographed, so high above the horizon (degrees): it is looked at
+#: from there (choice, reports/levels-of-detail.md).
+PSEUDO_VIEWS, PSEUDO_ELEVATION = 4, 35.0
 #: They draw a leaf at most so wide and high (pixels): eight for each cell.
 MAX_WINDOW_PX = 512
 #: Anchors by which it is told how much of a leaf a camera shows.
@@ -46,7 +50,9 @@ COLOR_WEIGHTS = 1e-3, 1e3
 def bake_leaf(model: AnchorModel, cameras: CameraTable) -> tuple[Gaussians, Float[np.ndarray, " n"]]:
     """The Gaussians that the best training cameras see of a few anchors, and how many pixels each makes there."""
     positions = model.anchors.positions.numpy()
-    windows = [window for camera in cameras.choose(positions) if (window := _turned(camera, positions)) is not None]
+    chosen = cameras.choose(positions)
+    chosen += _pseudo_views(chosen, np.median(positions, axis=0))
+    windows = [window for camera in chosen if (window := _turned(camera, positions)) is not None]
     shown = [view_contributions(model, window) for window in windows]
     pixels = np.zeros(gaussian_count(model))
     for view in shown:
@@ -90,7 +96,8 @@ def merge_cells(gaussians: NodeGaussians, cell: float, errors: Float[np.ndarray,
     merged = merge_by_moments(gaussians, groups, weights, enlarge=1.0)
     apart = means - merged.means.double().numpy()[groups]
     square = np.average(errors**2 + (apart * apart).sum(1), weights=weights)
-    return merged, float(np.sqrt(square))
+    # Neighbors are drawn, and found to have faded out, sixteen and more at once.
+    return merged.select(get_backend(merged.means.device).morton_order(merged.means)), float(np.sqrt(square))
 
 
 def _nearest_means(
@@ -141,6 +148,19 @@ def node_record(
 
 def _box(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6"]:
     return np.concatenate([points.min(0), points.max(0)]).astype(np.float64)
+
+
+def _pseudo_views(cameras: Sequence[Camera], center: Float[np.ndarray, "3"]) -> list[Camera]:
+    """Cameras all around a place, as far from it as some cameras are. They have yet to be turned towards it."""
+    distance = np.median([np.linalg.norm(camera.position - center) for camera in cameras])
+    azimuths, up = 2 * np.pi * np.arange(PSEUDO_VIEWS) / PSEUDO_VIEWS, np.radians(PSEUDO_ELEVATION)
+    views = list[Camera]()
+    for azimuth in azimuths:
+        away = np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
+        pose = np.array(cameras[0].camera_from_world)
+        pose[:3, 3] = -pose[:3, :3] @ (center + distance * away)
+        views.append(replace(cameras[0], camera_from_world=pose))
+    return views
 
 
 def _turned(camera: Camera, positions: Float[np.ndarray, "n 3"]) -> Camera | None:
