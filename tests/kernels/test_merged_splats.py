@@ -12,6 +12,7 @@ from support.decode_scenes import CAMERAS
 from support.gaussians import random_gaussians
 from support.instruction_sets import every_instruction_set, on_threads, using
 from vdgs.geometry.camera import Camera
+from vdgs.kernels import get_backend
 from vdgs.kernels.constants import ALPHA_MIN, DILATION_PX2
 from vdgs.kernels.cpu.merged_splats import merged_splats as native
 from vdgs.kernels.kernel_types import SPLAT_TENSORS, MergedGaussians
@@ -66,11 +67,29 @@ def test_the_native_kernel_draws_what_the_twin_does(n: int, degree: int, camera:
     torch.testing.assert_close(found.conics[drawn].double(), wanted.conics[drawn], atol=1e-5, rtol=2e-3)
 
 
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_parts_of_a_view_show_what_all_of_it_shows(camera: Camera) -> None:
+    """Although each part leaves out what lies beside it."""
+    every = merged(4000, 1, camera)
+    sorted_rows = torch.from_numpy(camera.project(every.means.numpy())[0][:, 0].argsort())
+    gaussians = MergedGaussians(*(tensor[sorted_rows] for tensor in every))
+    kernels, left, black = get_backend(torch.device("cpu")), camera.width // 3, torch.zeros(3)
+    whole = kernels.rasterize(native([gaussians], camera), black, camera.width, camera.height).image
+    assert (whole > 0.1).float().mean() > 0.05
+    for first, last in ((0, left), (left, camera.width)):
+        part = camera.cropped(first, 0, last, camera.height)
+        splats = native([gaussians], part)
+        assert (splats.opacities == 0).sum() > (native([gaussians], camera).opacities == 0).sum()
+        image = kernels.rasterize(splats, black, part.width, part.height).image
+        torch.testing.assert_close(image, whole[:, first:last], atol=2e-5, rtol=0)
+
+
 def test_halves_become_floats_exactly():
     """Also those below the least normal one, infinity and NaN."""
     every = torch.arange(1 << 16, dtype=torch.int32).to(torch.uint16).view(torch.float16)
     ones, zeros = torch.ones(len(every)).half(), torch.zeros(len(every)).half()
     one = merged(len(every), 0, CAMERA)._replace(opacity_logits=every, log_weight_mean=zeros, opacity_factors=ones)
+    one = one._replace(means=torch.tensor([0.0, 0.0, 9.0]).expand(len(every), 3))
     as_floats = native([MergedGaussians(*(tensor.float() for tensor in one))], CAMERA)
     found = native([one], CAMERA)
     assert torch.equal(found.opacities.view(torch.int32), as_floats.opacities.view(torch.int32))

@@ -26,7 +26,8 @@ LEAST_WEIGHT = 1e-30
 
 
 def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
-    """The splats of merged Gaussians in a view, part after part, without aliasing; opacity 0 where none is to be drawn.
+    """The splats of merged Gaussians in a view, part after part, without aliasing; opacity 0 where none is to be drawn,
+    and, if an implementation wants, where no pixel of the image shows any.
 
     A splat is as much more transparent as the blur of a pixel enlarges it (Mip-Splatting, eq. 9): the blur that a model
     has learnt is part of its merged Gaussians. One that covers several times as much as itself is drawn as so many

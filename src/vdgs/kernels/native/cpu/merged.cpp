@@ -1,6 +1,9 @@
 // The splats of merged Gaussians in a view, sixteen at a time, straight from numbers in half precision: what they look
 // like, and how much of what they stand for is drawn. The formulas are explained in
 // src/vdgs/kernels/torch_ref/merged_splats.py.
+#include <algorithm>
+#include <cmath>
+
 #include "bindings.h"
 #include "cpu/rows.h"
 #include "cpu/sh_basis.h"
@@ -13,6 +16,8 @@ namespace {
 
 constexpr int64_t kPiece = 2048;
 constexpr float kRootHalf = 0.70710678118654752f;
+// Nothing is drawn beyond so many standard deviations, squared: exp(-q / 2) is less than kAlphaMin there.
+constexpr float kReachSquared = 11.09f;
 
 // Rows of Gaussians. Places are floats, everything else is `Number`s.
 template <class Number>
@@ -112,6 +117,14 @@ VDGS_INLINE void colors_of(const MergedRows<Number>& rows, int64_t first, const 
   for (int c = 0; c < 3; ++c) color[c] = max(color[c], splat(0.0f));
 }
 
+// Whether some of sixteen may reach the image: as `cull` finds out of anchors, but to the last pixel that is drawn.
+VDGS_INLINE bool some_in_sight(const Camera& camera, const F16 (&m)[3], const F16 (&s)[3]) {
+  Sight<F16> sight = sight_of(camera, into_camera(camera, Vec3<F16>{m[0], m[1], m[2]}));
+  sight.least = splat(kReachSquared / 9.0f) * sight.least;
+  const float wider = 0.5f * std::log(kReachSquared / 9.0f);
+  return any(sight.holds(max(max(s[0], s[1]), s[2]) + splat(wider)));
+}
+
 void clear_sixteen(int64_t first, int64_t n, const SplatRows& out) {
   const int64_t count = std::min<int64_t>(kLanes, n - first);
   const auto clear = [&](float* rows, int64_t width) { std::fill_n(rows + first * width, count * width, 0.0f); };
@@ -127,6 +140,7 @@ void draw_sixteen(const MergedRows<Number>& rows, const Camera& camera, int64_t 
   F16 m[3], s[3], q[4], logit[1], covers[1], weight_mean[1], weight_std[1], color[3];
   load_columns(rows.means, first, n, m);
   load_columns(rows.log_scales, first, n, s);
+  if (!some_in_sight(camera, m, s)) return clear_sixteen(first, n, out);
   load_columns(rows.quaternions, first, n, q);
   load_columns(rows.opacity_logits, first, n, logit);
   load_columns(rows.covers, first, n, covers);
