@@ -22,7 +22,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_format import LOD_FORMAT, NODE_FORMAT
 from vdgs.system.atomic_files import write_atomic
-from vdgs.system.tensors import read_tensors, read_tensors_unchecked, tensors_crc32, write_tensors
+from vdgs.system.tensors import map_tensors, read_tensors, tensors_crc32, write_tensors
 
 #: What to do about a tree that cannot be used.
 REBUILD_HINT = "Delete that folder and make the tree again: vdgs lod RUN"
@@ -146,8 +146,8 @@ def _header(path: Path) -> dict[str, Any]:
 
 def _read(path: Path, kind: type[NodeGaussians] | type[Anchors]) -> dict[str, Tensor]:
     try:
-        tensors = read_tensors_unchecked(path)
-        if _header(path)["crc32"] != tensors_crc32(tensors):
+        tensors, metadata = map_tensors(path)
+        if json.loads(metadata[NODE_FORMAT])["crc32"] != tensors_crc32(tensors):
             raise ValueError("its checksum does not agree")
         if missing := {each.name for each in fields(kind) if each.default is MISSING} - set(tensors):
             raise ValueError(f"it has no {', '.join(sorted(missing))}")

@@ -101,28 +101,21 @@ class LodScene:
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
         """The splats of a view, and to which of `places` each belongs."""
         cut = self._cut(camera)
-        shown, sources, first = list[Splats](), list[Tensor](), 0
         assemble = partial(self._assemble_anchors, camera=camera)
         anchors = assemble(cut.leaves) if self.culls_leaves else _held(self._anchors, cut.leaves, assemble)
+        rows, splats, first = torch.zeros(0, dtype=torch.long, device=self.device), None, 0
         if anchors is not None:
             drawn = anchors if self.pixel is None else without_aliasing(anchors, self.pixel)
             rows, splats = view_splats(drawn, camera, image_index)
-            sources.append(rows)
-            shown.append(splats)
             first = len(anchors.anchors)
-        nodes = _held(self._nodes, cut.nodes, self._read_nodes)
-        if nodes:
-            splats = merged_splats(nodes, camera)
-            sources.append(torch.arange(first, first + len(splats.depths), device=self.device))
-            shown.append(splats)
-        if not shown:
-            empty = torch.zeros(0, device=self.device)
-            wide = empty.new_zeros(0, 3)
-            return empty.long(), Splats(empty.new_zeros(0, 2), wide, empty, wide, empty)
-        if len(shown) == 1:
-            return sources[0], shown[0]
-        columns = zip(*((s.means_px, s.conics, s.depths, s.colors, s.opacities) for s in shown), strict=True)
-        return torch.cat(sources), Splats(*(torch.cat(column) for column in columns))
+        if nodes := _held(self._nodes, cut.nodes, self._read_nodes):
+            splats = merged_splats(nodes, camera, splats)
+            places = torch.arange(first, first + len(splats.depths) - len(rows), device=self.device)
+            rows = torch.cat([rows, places])
+        if splats is None:
+            empty, wide = torch.zeros(0, device=self.device), torch.zeros(0, 3, device=self.device)
+            splats = Splats(empty.new_zeros(0, 2), wide, empty, wide, empty)
+        return rows, splats
 
     def values(self, camera: Camera, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
         """A value for each of the places that a view is drawn from, anchors and then centers of merged Gaussians:

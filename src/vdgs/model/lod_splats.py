@@ -31,7 +31,8 @@ class FadedNode(NamedTuple):
         return MergedGaussians(**columns, opacity_factors=self.factors)
 
 
-def merged_splats(nodes: Sequence[FadedNode], camera: Camera) -> Splats:
-    """The splats of the merged Gaussians of some nodes, at least one, in a view, node after node
-    (`kernels.torch_ref.merged_splats`)."""
-    return get_backend(nodes[0].gaussians.means.device).merged_splats([node.part() for node in nodes], camera)
+def merged_splats(nodes: Sequence[FadedNode], camera: Camera, before: Splats | None = None) -> Splats:
+    """The splats of the merged Gaussians of some nodes, at least one, in a view, node after node, behind those that
+    come `before` (`kernels.torch_ref.merged_splats`)."""
+    kernels = get_backend(nodes[0].gaussians.means.device)
+    return kernels.merged_splats([node.part() for node in nodes], camera, before)

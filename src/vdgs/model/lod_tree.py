@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 from pathlib import Path
 from typing import TypeVar
 
@@ -185,10 +185,15 @@ class LodTree:
 
 def side_by_side(drawn: Callable[[int], _Content], nodes: tuple[int, ...]) -> list[_Content]:
     """What some nodes draw, in their order: they are read, checked and faded on as many threads as kernels use."""
-    if (workers := min(get_num_threads(), MAX_READERS, len(nodes))) <= 1:
+    if min(get_num_threads(), len(nodes)) <= 1:
         return [drawn(node) for node in nodes]
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(drawn, nodes))
+    return list(_readers(min(get_num_threads(), MAX_READERS)).map(drawn, nodes))
+
+
+@cache
+def _readers(count: int) -> ThreadPoolExecutor:
+    """Threads that read nodes, kept: to begin some for each part of a picture takes longer than many a part."""
+    return ThreadPoolExecutor(count, "vdgs-reader")
 
 
 def _halve(

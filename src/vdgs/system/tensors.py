@@ -82,6 +82,31 @@ def read_tensors_unchecked(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
+def map_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """All tensors and the metadata of a file that `write_tensors` wrote, mapped into memory in place of read: nothing
+    is copied, and the system takes pages back where memory is short. Changes to the tensors do not reach the file.
+    Raises OSError, ValueError or KeyError for other files."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        if not 2 <= length <= size - 8:
+            raise ValueError("it has no header")
+        entries = json.loads(file.read(length))
+    metadata = entries.pop("__metadata__", {})
+    if max((entry["data_offsets"][1] for entry in entries.values()), default=0) != size - 8 - length:
+        raise ValueError("it is not as long as its header says")
+    content = torch.from_file(str(path), shared=False, size=size, dtype=torch.uint8)
+    return {name: _part(content[8 + length :], name, entry) for name, entry in entries.items()}, metadata
+
+
+def _part(content: Tensor, name: str, entry: dict[str, Any]) -> Tensor:
+    """A tensor of a file, of whose bytes behind the header it takes some."""
+    dtype, shape, (begin, end) = DTYPES[entry["dtype"]], torch.Size(entry["shape"]), entry["data_offsets"]
+    if end - begin != shape.numel() * dtype.itemsize or content[begin:].storage_offset() % dtype.itemsize:
+        raise ValueError(f"{name} has not the bytes of its shape")
+    return content[begin:end].view(dtype).reshape(shape)
+
+
 def file_size_and_crc32(path: Path) -> tuple[int, int]:
     """Bytes and CRC-32 of a file, read piece by piece: states are large."""
     size = crc = 0

@@ -12,19 +12,21 @@ from torch import Tensor
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.arguments import contiguous, packed_camera
-from vdgs.kernels.kernel_types import MergedGaussians, Splats
+from vdgs.kernels.kernel_types import SPLAT_TENSORS, MergedGaussians, Splats
 from vdgs.kernels.spherical_harmonics import num_sh_bases
 
 
-def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
+def merged_splats(parts: Sequence[MergedGaussians], camera: Camera, before: Splats | None = None) -> Splats:
     """As `torch_ref.merged_splats`, in float32. Same bits for any number of threads, and for numbers that are given in
     half precision or as float32. Raises ValueError for shapes that do not match."""
-    ends = [0, *accumulate(len(part.means) for part in parts)]
+    first = 0 if before is None else len(before.depths)
+    ends = list(accumulate((len(part.means) for part in parts), initial=first))
     splats = Splats(*(torch.empty(ends[-1], *shape) for shape in ((2,), (3,), (), (3,), ())))
-    tensors = (splats.means_px, splats.conics, splats.depths, splats.colors, splats.opacities)
+    for name in SPLAT_TENSORS if before is not None else ():
+        getattr(splats, name)[:first] = getattr(before, name)
     packed = packed_camera(camera)
-    for part, first, end in zip(parts, ends, ends[1:], strict=False):
-        _draw(part, packed, [tensor[first:end] for tensor in tensors])
+    for part, begin, end in zip(parts, ends, ends[1:], strict=False):
+        _draw(part, packed, [getattr(splats, name)[begin:end] for name in SPLAT_TENSORS])
     return splats
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import ALPHA_MIN, DILATION_PX2
 from vdgs.kernels.gaussian_projection import GaussianShapes, project_gaussians
-from vdgs.kernels.kernel_types import MergedGaussians, Splats
+from vdgs.kernels.kernel_types import SPLAT_TENSORS, MergedGaussians, Splats
 from vdgs.kernels.spherical_harmonics import eval_sh_colors
 
 #: Logarithms of weights are taken to differ by at least so much among the members of a Gaussian, also where it has one
@@ -25,9 +25,9 @@ MAX_STDS = 6.0
 LEAST_WEIGHT = 1e-30
 
 
-def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
-    """The splats of merged Gaussians in a view, part after part, without aliasing; opacity 0 where none is to be drawn,
-    and, if an implementation wants, where no pixel of the image shows any.
+def merged_splats(parts: Sequence[MergedGaussians], camera: Camera, before: Splats | None = None) -> Splats:
+    """The splats of merged Gaussians in a view, part after part, behind those that come `before`, without aliasing;
+    opacity 0 where none is to be drawn and, if an implementation wants, where no pixel of the image shows any.
 
     A splat is as much more transparent as the blur of a pixel enlarges it (Mip-Splatting, eq. 9): the blur that a model
     has learnt is part of its merged Gaussians. One that covers several times as much as itself is drawn as so many
@@ -36,8 +36,8 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
     """
     g = _joined(parts)
     degree = math.isqrt(g.shN.shape[1] + 1) - 1
-    found = project_gaussians(g.means, GaussianShapes(g.log_scales.exp(), g.quaternions), camera)
-    seen, shares = found.projected, found.compensation
+    projection = project_gaussians(g.means, GaussianShapes(g.log_scales.exp(), g.quaternions), camera)
+    seen, shares = projection.projected, projection.compensation
     # Members fade as the Gaussian does that stands for them.
     assert g.opacity_factors is not None
     faded = g.log_weight_mean + g.opacity_factors.clamp_min(LEAST_WEIGHT).log()
@@ -49,7 +49,10 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera) -> Splats:
     whole, thinned = (opacities * -torch.expm1(layers * left) for left in (1.0, shown))
     # What the rasterizer cuts off this splat itself has been counted with its members.
     drawn = torch.minimum(whole, thinned + ALPHA_MIN)
-    return Splats(seen.means_px, seen.conics, seen.depths, colors, torch.where(seen.valid & (shown > 0), drawn, 0))
+    found = Splats(seen.means_px, seen.conics, seen.depths, colors, torch.where(seen.valid & (shown > 0), drawn, 0))
+    if before is None:
+        return found
+    return Splats(*(torch.cat([getattr(before, name), getattr(found, name)]) for name in SPLAT_TENSORS))
 
 
 def _joined(parts: Sequence[MergedGaussians]) -> MergedGaussians:
