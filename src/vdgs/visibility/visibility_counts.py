@@ -73,25 +73,27 @@ class NearbyCameras:
 
     def of(self, positions: Float[Tensor, "p 3"]) -> list[Camera]:
         """Those whose pictures, widened by `FADE_MARGIN`, reach the sphere about these places; others count none."""
-        return self._reached(*_sphere(positions)) if len(positions) else []
+        return [self._cameras[k] for k in self._reached(*_sphere(positions))] if len(positions) else []
 
     def fade_factors(self, positions: Float[Tensor, "p 3"], min_visibility: int) -> Float[Tensor, " p"]:
-        """`fade_factors` of all the cameras. Where enough of them hold the whole sphere about the places, or too few
-        reach it, none of these is looked at."""
+        """`fade_factors` of all the cameras. Where too few reach the sphere about the places, or enough of them hold
+        all of it, none of these is looked at."""
         if not len(positions):
             return positions.new_zeros(0)
         center, radius = _sphere(positions)
-        if ((_least_distances(self._planes, center) > radius) & self._is_pinhole).sum() >= min_visibility:
-            return positions.new_ones(len(positions))
-        if len(near := self._reached(center, radius)) < min_visibility:
+        near = self._reached(center, radius)
+        if len(near) < min_visibility:
             return positions.new_zeros(len(positions))
-        return fade_factors(positions, near, min_visibility)
+        hold = self._is_pinhole[near] & (_least_distances(self._planes[:, near], center) > radius)
+        if hold.sum() >= min_visibility:
+            return positions.new_ones(len(positions))
+        return fade_factors(positions, [self._cameras[k] for k in near], min_visibility)
 
-    def _reached(self, center: Float[np.ndarray, "3"], radius: float) -> list[Camera]:
+    def _reached(self, center: Float[np.ndarray, "3"], radius: float) -> Int[np.ndarray, " near"]:
+        """The numbers of the cameras whose widened pictures reach a sphere."""
         if not np.isfinite(radius):
-            return self._cameras
-        reached = ~self._is_pinhole | (_least_distances(self._widened, center) >= -radius)
-        return [self._cameras[k] for k in np.flatnonzero(reached)]
+            return np.arange(len(self._cameras))
+        return np.flatnonzero(~self._is_pinhole | (_least_distances(self._widened, center) >= -radius))
 
 
 def _sphere(positions: Float[Tensor, "p 3"]) -> tuple[Float[np.ndarray, "3"], float]:
@@ -103,7 +105,7 @@ def _sphere(positions: Float[Tensor, "p 3"]) -> tuple[Float[np.ndarray, "3"], fl
 def _frustum_planes(
     poses: Float[np.ndarray, "c 4 4"], lenses: Float[np.ndarray, "6 c"], more: Float[np.ndarray, " c"] | float,
     near: float,
-) -> Float[np.ndarray, "c 5 4"]:  # fmt: skip
+) -> Float[np.ndarray, "5 c 4"]:  # fmt: skip
     """Planes in the world, unit normals inwards and offsets: so far before each camera, and through its center and the
     edges of its picture (fx, fy, cx, cy, width, height), so many pixels larger on each side."""
     fx, fy, cx, cy, width, height = lenses
@@ -116,13 +118,13 @@ def _frustum_planes(
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     planes = normals @ poses[:, :3]
     planes[:, 0, 3] -= near
-    return planes
+    return np.ascontiguousarray(planes.transpose(1, 0, 2))
 
 
-def _least_distances(planes: Float[np.ndarray, "c 5 4"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, " c"]:
+def _least_distances(planes: Float[np.ndarray, "5 c 4"], place: Float[np.ndarray, "3"]) -> Float[np.ndarray, " c"]:
     """How far inside of the frustum of each camera a place is."""
-    distances = planes.reshape(-1, 4) @ np.append(place, 1.0)
-    return distances.reshape(len(planes), -1).min(axis=1, initial=np.inf)
+    least: np.ndarray = (planes @ np.append(place, 1.0)).min(axis=0)
+    return least
 
 
 def visibility_sampling_weights(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
