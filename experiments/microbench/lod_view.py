@@ -41,6 +41,8 @@ MOVES_PER_SECOND = 60
 STRIP_ROWS = 16
 #: What is near enough to full detail, in dB.
 NEAR_DB = 35.0
+#: Standpoints are found from so many anchors: the model is mapped, and what is read of it is resident.
+SAMPLED_ANCHORS = 1000
 #: A visitor who moves on while a picture becomes better does so after so many seconds.
 INTERRUPT_SECONDS = (0.6, 1.1, 1.6, 2.1)
 
@@ -130,10 +132,12 @@ def main() -> None:
 
 
 def standpoints(tree: LodScene, width: int, height: int) -> dict[str, Camera]:
-    """Cameras over all of a scene, halfway, and in a street."""
-    low, high = tree.tree.table.bounds[0, :3], tree.tree.table.bounds[0, 3:]
+    """Cameras over all of a scene, halfway, and in a street: the same for all trees of a model."""
+    some = tree.model.anchors.positions
+    some = some[:: max(1, len(some) // SAMPLED_ANCHORS)].numpy()
+    low, high = some.min(0), some.max(0)
     size, middle = float((high - low)[:2].max()), (low + high)[:2] / 2
-    ground = float(np.quantile(tree.tree.gaussians(0).means[:, 2].numpy(), 0.2))
+    ground = float(np.quantile(some[:, 2], 0.2))
 
     def camera(south: float, up: float, target_north: float, target_up: float = 0.0) -> Camera:
         place = np.array([middle[0], middle[1] - south, ground + up], np.float64)
