@@ -25,6 +25,7 @@ from vdgs.captures.first_view import FOV_DEG
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import configure_threads
 from vdgs.kernels.kernel_types import Raster
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_tree import ANCHOR_COST, LodCut
 from vdgs.model.renderer import Drawable, render
@@ -115,7 +116,7 @@ def main() -> None:
     scene = ViewerScene(open_run_or_checkpoint(options.run))
     tree = scene.tree(scene.names[0])
     assert tree is not None, "the run has no level-of-detail tree: vdgs lod RUN"
-    places = standpoints(tree, options.width, options.height)
+    places = standpoints(scene.model(scene.names[0]), options.width, options.height)
     visitor = Visitor(scene, DisplayOptions(min_visibility=options.min_visibility))
     visitor.ask(places["overview"])
     when, _ = visitor.wait(full=False)
@@ -131,9 +132,9 @@ def main() -> None:
         compare(name, rested[name] / 255.0, tree, camera, scene.pixel_at_camera_height, options.samples)
 
 
-def standpoints(tree: LodScene, width: int, height: int) -> dict[str, Camera]:
-    """Cameras over all of a scene, halfway, and in a street: the same for all trees of a model."""
-    some = tree.model.anchors.positions
+def standpoints(model: AnchorModel, width: int, height: int) -> dict[str, Camera]:
+    """Cameras over all of a scene, halfway, and in a street."""
+    some = model.anchors.positions
     some = some[:: max(1, len(some) // SAMPLED_ANCHORS)].numpy()
     low, high = some.min(0), some.max(0)
     size, middle = float((high - low)[:2].max()), (low + high)[:2] / 2

@@ -361,8 +361,14 @@ def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
     assert not has_lod(coarse.run, coarse.location)
     with pytest.raises(RunError, match=r"tree is of another version of vdgs\. Make it: vdgs lod .*--model coarse"):
         open_tree(opened)
-    (stage,) = lod_status(coarse.run, SimpleNamespace(of=lambda _: SimpleNamespace(output_id=opened.status.model_id)))
-    assert (stage.state, stage.reason) == ("stale", "made by another version of vdgs")
+    for merged, end in (("1-c", " --model coarse"), (None, "")):
+        models = {
+            "coarse": SimpleNamespace(output_id=opened.status.model_id),
+            "merge": SimpleNamespace(output_id=merged),
+        }
+        (stage,) = lod_status(coarse.run, SimpleNamespace(of=models.__getitem__))
+        assert (stage.state, stage.reason) == ("stale", "made by another version of vdgs")
+        assert stage.command == f"vdgs lod {coarse.run.path}{end}"
     (folder / TREE_FILE).unlink()
     with pytest.raises(RunError, match="no finished level-of-detail tree"):
         open_tree(opened)

@@ -49,8 +49,8 @@ from vdgs.system.units import data_size
 
 #: Anchors of a leaf at most.
 MAX_LEAF_ANCHORS = 8192
-#: Disk that merged Gaussians of all levels take for each Gaussian of the anchors (bytes): 20 to 32 measured.
-NODE_BYTES_PER_GAUSSIAN = 40
+#: Disk that merged Gaussians of all levels take for each Gaussian of the anchors (bytes): 24 to 38 measured.
+NODE_BYTES_PER_GAUSSIAN = 44
 
 
 def build_lod(context: RunContext, request: LodRequest, console: Console) -> Path:
@@ -101,6 +101,7 @@ def _key(model_id: str) -> str:
     settings = [
         MAX_LEAF_ANCHORS, lod_bake.CELLS_PER_EDGE, lod_bake.CAMERAS_PER_LEAF, lod_bake.MAX_CANDIDATES,
         lod_bake.SAMPLES, lod_bake.SH_DEGREE, lod_bake.MAX_WINDOW_PX, lod_bake.MIN_LEAF_ERROR, lod_bake.COLOR_WEIGHTS,
+        lod_bake.KMEANS_STEPS, lod_bake.PSEUDO_VIEWS, lod_bake.PSEUDO_ELEVATION,
     ]  # fmt: skip
     return hashlib.sha256(json.dumps([LOD_FORMAT, model_id, settings]).encode()).hexdigest()[:16]
 

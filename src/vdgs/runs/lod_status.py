@@ -26,14 +26,15 @@ def lod_status(run: RunFolder, status: RunStatus) -> tuple[StageStatus, ...]:
     if not folder.status_file.exists():
         return ()
     found = folder.status()
-    models = {status.of(stage).output_id for stage in ("coarse", "merge")}
+    coarse, merged = (status.of(stage).output_id for stage in ("coarse", "merge"))
     state: StageState = "done" if found.state == "done" else "stopped"
     reason = "" if state == "done" else "it continues"
-    if state == "done" and found.model_id not in models:
+    if state == "done" and found.model_id not in (coarse, merged):
         state, reason = "stale", "made of another model than the run has now"
     elif state == "done" and not is_of_present_version(run):
         state, reason = "stale", "made by another version of vdgs"
     elif state == "stopped" and is_known_locked(folder.path):
         state, reason = "running", ""
-    command = f"vdgs lod {shell_word(run.path)}"
+    of_coarse = found.model_id == coarse and merged is not None
+    command = f"vdgs lod {shell_word(run.path)}" + (" --model coarse" if of_coarse else "")
     return (StageStatus(name="lod", state=state, folder="lod", reason=reason, status=found, command=command),)
