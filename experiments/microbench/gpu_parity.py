@@ -237,7 +237,7 @@ def fade_factors(kernels: KernelBackend, scene: ParityScene) -> Results:
 
 
 def merged_splats(kernels: KernelBackend, scene: ParityScene) -> Results:
-    """Of members about as large as the least that is drawn."""
+    """Of members about as large as the least that is drawn; those beside the picture may be left out."""
     a, count = scene.anchors, len(scene.anchors)
     std = scene.random(count, seed=3).abs()
     gaussians = MergedGaussians(
@@ -246,7 +246,8 @@ def merged_splats(kernels: KernelBackend, scene: ParityScene) -> Results:
         0.1 * std[:, None] * scene.random(count, 3),
     )  # fmt: skip
     splats = kernels.merged_splats([gaussians], scene.camera)
-    drawn = splats.opacities > 0.005
+    size = splats.means_px.new_tensor([scene.width, scene.height])
+    drawn = (splats.opacities > 0.005) & ((splats.means_px > 0) & (splats.means_px < size)).all(1)
     values = {name: getattr(splats, name) for name in SPLAT_TENSORS}
     return {name: torch.where(drawn.view(-1, *[1] * (t.dim() - 1)), t, 0) for name, t in values.items()}
 

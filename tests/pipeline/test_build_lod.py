@@ -23,6 +23,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import SPLAT_TENSORS
 from vdgs.kernels.torch_ref.merged_splats import shown_members
+from vdgs.model import lod_tree
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.decoder import Decoder
@@ -32,7 +33,7 @@ from vdgs.model.lod_format import LOD_FORMAT, TREE_FILE
 from vdgs.model.lod_quadtree import build_quadtree
 from vdgs.model.lod_scene import LodScene
 from vdgs.model.lod_splats import FadedNode, merged_splats
-from vdgs.model.lod_tree import LodTree
+from vdgs.model.lod_tree import LodCut, LodTree
 from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
 from vdgs.pipeline.build_lod import build_tree
@@ -105,7 +106,7 @@ def test_without_any_error_the_picture_is_that_of_the_model_to_the_last_bit(scen
     torch.testing.assert_close(drawn, expected, rtol=1e-4, atol=1e-2, equal_nan=True)
 
 
-def test_places_that_have_faded_out_are_not_drawn_and_have_no_values(scene, model):
+def test_places_that_have_faded_out_are_not_drawn(scene, model):
     """As the viewer leaves out what few cameras see: of Gaussians of anchors and of merged ones alike."""
     camera, half = camera_at(0.0, 0.0, 6.0), scene.with_fade(lambda places: (places[:, 0] > 0).float(), "half")
     factors = (gaussian_means(model.anchors)[..., 0] > 0).float()
@@ -125,19 +126,52 @@ def test_places_that_have_faded_out_are_not_drawn_and_have_no_values(scene, mode
         torch.testing.assert_close(drawn, whole / 2, atol=1e-6, rtol=1e-5)
 
 
+def mixed_cut(scene: LodScene) -> LodCut:
+    """Some children of the root by their merged Gaussians, and the leaves below the others."""
+    table = scene.tree.table
+    children = np.flatnonzero(table.parent == 0).tolist()
+    above = np.arange(len(table))
+    for node in range(1, len(table)):
+        above[node] = node if table.parent[node] == 0 else above[table.parent[node]]
+    leaves = np.flatnonzero((table.anchors > 0) & np.isin(above, children[2:])).tolist()
+    assert len(children) >= 3
+    assert leaves
+    return LodCut(tuple(children[:2]), tuple(leaves))
+
+
+def test_a_node_that_has_wholly_faded_out_is_left_out_and_the_others_keep_their_values(scene, monkeypatch):
+    camera, cut = camera_at(0.0, 0.0, 6.0), mixed_cut(scene)
+    monkeypatch.setattr(LodTree, "cut", lambda *_: cut)
+    gone = scene.tree.gaussians(cut.nodes[0]).means
+    low, high = gone.amin(0), gone.amax(0)
+    fade = lambda places: (~((places >= low) & (places <= high)).all(1)).float()  # noqa: E731
+    whole, faded = (each.at_error(1.0) for each in (scene, scene.with_fade(fade, "one node")))
+    for drawn in (whole, faded):
+        rows, splats = drawn.view_splats(camera)
+        places = drawn.values(camera, lambda _, places: places())
+        merged = rows >= len(places) - sum(len(scene.tree.gaussians(node)) for node in cut.nodes[drawn is faded :])
+        shown = merged & (splats.opacities > 0)
+        pixels, _ = camera.project(places[rows[shown]].numpy())
+        torch.testing.assert_close(splats.means_px[shown], torch.from_numpy(pixels).float(), atol=1e-3, rtol=1e-4)
+        assert int(rows.max()) == len(places) - 1
+    assert len(whole.values(camera, lambda _, places: places())) - len(places) >= len(gone)
+
+
 def test_parts_of_a_faded_picture_read_each_node_once_on_any_number_of_threads(scene, monkeypatch):
-    camera, read = camera_at(0.0, 0.0, 6.0), list[int]()
-    load = LodTree.load
-    monkeypatch.setattr(LodTree, "load", lambda tree, node: (read.append(node), load(tree, node))[1])
+    camera, read, cut = camera_at(0.0, 0.0, 6.0), list[Path](), mixed_cut(scene)
+    monkeypatch.setattr(LodTree, "cut", lambda *_: cut)
+    for name in ("load_node", "load_anchors"):
+        load = getattr(lod_tree, name)
+        monkeypatch.setattr(lod_tree, name, lambda path, load=load: (read.append(path), load(path))[1])
     pictures = []
     for threads in (1, 3):
-        monkeypatch.setattr("vdgs.model.lod_tree.get_num_threads", lambda threads=threads: threads)
+        monkeypatch.setattr(lod_tree, "get_num_threads", lambda threads=threads: threads)
         anew = replace(scene, tree=scene.tree.with_own_cache(1 << 28))
         half = anew.with_fade(lambda places: places[:, 0].clamp(0, 1), f"{threads}").at_error(2.0).for_view(camera)
         top = camera.height // 2
         for part in (camera.cropped(0, 0, camera.width, top), camera.cropped(0, top, camera.width, camera.height)):
             pictures.append(render(half, part).image)
-        assert read
+        assert len(read) == len(cut.nodes) + len(cut.leaves)
         assert len(set(read)) == len(read)
         read.clear()
     assert all(torch.equal(a, b) for a, b in zip(pictures[:2], pictures[2:], strict=True))

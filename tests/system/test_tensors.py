@@ -12,7 +12,14 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from support.commands import python
-from vdgs.system.tensors import DTYPES, file_size_and_crc32, read_tensors_unchecked, tensors_crc32, write_tensors
+from vdgs.system.tensors import (
+    DTYPES,
+    file_size_and_crc32,
+    map_tensors,
+    read_tensors_unchecked,
+    tensors_crc32,
+    write_tensors,
+)
 
 SHAPES = st.lists(st.integers(0, 4), max_size=3)
 
@@ -38,11 +45,13 @@ def test_the_bytes_are_those_of_the_library(folder, kinds, note):
     write_tensors(folder / "ours", tensors, note)
     save_file(tensors, folder / "theirs", metadata=note)
     assert (folder / "ours").read_bytes() == (folder / "theirs").read_bytes()
-    ours = read_tensors_unchecked(folder / "ours")
-    assert ours.keys() == tensors.keys()
-    for name, expected in tensors.items():
-        assert ours[name].dtype == expected.dtype
-        assert torch.equal(ours[name], expected)
+    mapped, metadata = map_tensors(folder / "ours")
+    assert metadata == (note or {})
+    for ours in (read_tensors_unchecked(folder / "ours"), mapped):
+        assert ours.keys() == tensors.keys()
+        for name, expected in tensors.items():
+            assert ours[name].dtype == expected.dtype
+            assert torch.equal(ours[name], expected)
 
 
 def test_rows_out_of_order_and_the_decoder_are_written_as_they_read(tmp_path):
@@ -69,8 +78,27 @@ def test_a_damaged_file_is_an_error(tmp_path, spoil):
     data = path.read_bytes()
     changed = {"cut": data[:-4], "shape": data.replace(b"[6]", b"[7]"), "header": data.replace(b"{", b"!", 1)}
     path.write_bytes(changed[spoil])
-    with pytest.raises(ValueError, match=r"a has not|Expecting value"):
-        read_tensors_unchecked(path)
+    for read in (read_tensors_unchecked, map_tensors):
+        with pytest.raises(ValueError, match=r"a has not|Expecting value|not as long as its header says"):
+            read(path)
+
+
+def test_changes_to_mapped_tensors_do_not_reach_the_file_which_may_be_removed(tmp_path):
+    path = tmp_path / "t"
+    write_tensors(path, {"a": torch.arange(6.0)})
+    before = path.read_bytes()
+    first, second = (map_tensors(path)[0]["a"] for _ in range(2))
+    first += 1
+    assert path.read_bytes() == before
+    path.unlink()
+    assert torch.equal(second, torch.arange(6.0))
+
+
+def test_a_file_that_is_no_tensors_is_not_mapped(tmp_path):
+    for content in (b"", b"short", (9).to_bytes(8, "little") + b"{}", (1 << 40).to_bytes(8, "little") + b"{}" * 9):
+        (tmp_path / "t").write_bytes(content)
+        with pytest.raises(ValueError, match="it has no header"):
+            map_tensors(tmp_path / "t")
 
 
 def test_checksums_are_crc_32(tmp_path):

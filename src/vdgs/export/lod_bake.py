@@ -1,9 +1,9 @@
 """What the nodes of a level-of-detail tree draw: baked anchors in its leaves, and ever coarser merges of them above.
 
-A leaf is baked by itself, from the few training cameras that show it best from as many sides as possible: opacities,
-shapes and colors are what those cameras see of its anchors. All Gaussians whose centers share a cell of space then
-become one (`merge_by_moments`). The side of a cell is a fixed part of the side of the node, so that it doubles from
-level to level.
+A leaf is baked by itself, from the few training cameras that show it best from as many sides as possible, and from
+views all around it: opacities, shapes and colors are what is seen there of its anchors. All Gaussians whose centers
+share a cell of space then become one (`merge_by_moments`). The side of a cell is a fixed part of the side of the node,
+so that it doubles from level to level.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from vdgs.model.lod_nodes import NodeRecord
 CELLS_PER_EDGE = 64
 #: Training cameras that a leaf is baked from, and of how many of the nearest they are chosen.
 CAMERAS_PER_LEAF, MAX_CANDIDATES = 8, 64
-#: And from so many views all around it that nobody photographed, so high above the horizon (degrees): it is looked at
-#: from there (choice, reports/levels-of-detail.md).
+#: And so many views that nobody photographed, all around it and so many degrees above the horizon: visitors look from
+#: there (choice, reports/levels-of-detail.md).
 PSEUDO_VIEWS, PSEUDO_ELEVATION = 4, 35.0
 #: They draw a leaf at most so wide and high (pixels): eight for each cell.
 MAX_WINDOW_PX = 512
@@ -48,7 +48,8 @@ COLOR_WEIGHTS = 1e-3, 1e3
 
 
 def bake_leaf(model: AnchorModel, cameras: CameraTable) -> tuple[Gaussians, Float[np.ndarray, " n"]]:
-    """The Gaussians that the best training cameras see of a few anchors, and how many pixels each makes there."""
+    """The Gaussians that the best training cameras and views all around see of a few anchors, and how many pixels each
+    makes there."""
     positions = model.anchors.positions.numpy()
     chosen = cameras.choose(positions)
     chosen += _pseudo_views(chosen, np.median(positions, axis=0))
@@ -96,7 +97,7 @@ def merge_cells(gaussians: NodeGaussians, cell: float, errors: Float[np.ndarray,
     merged = merge_by_moments(gaussians, groups, weights, enlarge=1.0)
     apart = means - merged.means.double().numpy()[groups]
     square = np.average(errors**2 + (apart * apart).sum(1), weights=weights)
-    # Neighbors are drawn, and found to have faded out, sixteen and more at once.
+    # In the order of a curve, for the kernels skip sixteen at once that a view does not show, or that have faded out.
     return merged.select(get_backend(merged.means.device).morton_order(merged.means)), float(np.sqrt(square))
 
 
@@ -120,7 +121,7 @@ def _nearest_means(
 def _kmeans_step(
     means: Float[np.ndarray, "n 3"], groups: Int[np.ndarray, " n"], weights: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
-    """The group whose mean by weight is nearest to each, numbered anew from 0 on; some may be left with none."""
+    """The group whose mean by weight is nearest to each, and groups are numbered anew, without those that lose all."""
     sums = np.stack([np.bincount(groups, weights * axis) for axis in means.T], 1)
     nearest = cKDTree(sums / np.bincount(groups, weights)[:, None]).query(means)[1]
     return np.unique(nearest, return_inverse=True)[1]
@@ -229,7 +230,7 @@ def leaf_gaussians(model: AnchorModel, cameras: CameraTable, edge: float) -> tup
 
 
 def _color_weights(baked: Gaussians, pixels: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """By how much colors count beside the weights of a leaf's Gaussians: the root of what cameras see of each, in parts
+    """By how much colors count beside the weights of a leaf's Gaussians: the root of what views show of each, in parts
     of its weight (choice, reports/levels-of-detail.md). What is hidden from all cameras may show from elsewhere."""
     weights = gaussian_weights(baked)
     seen = pixels * weights.sum() / np.maximum(weights * pixels.sum(), 1e-300)

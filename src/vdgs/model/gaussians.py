@@ -50,7 +50,7 @@ class Gaussians:
 
     def select(self: AnyGaussians, rows: Tensor) -> AnyGaussians:
         """The Gaussians of the given rows (indices or mask)."""
-        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        rows = (rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows).to(self.means.device)
         return replace(self, **{name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()})
 
     def float(self: AnyGaussians) -> AnyGaussians:

@@ -152,5 +152,5 @@ def _read(path: Path, kind: type[NodeGaussians] | type[Anchors]) -> dict[str, Te
         if missing := {each.name for each in fields(kind) if each.default is MISSING} - set(tensors):
             raise ValueError(f"it has no {', '.join(sorted(missing))}")
         return tensors
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError) as error:
         raise VdgsError(f"{path}: is missing or damaged ({error}). {REBUILD_HINT}") from error

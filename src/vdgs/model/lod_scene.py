@@ -45,7 +45,7 @@ class LodScene:
     pixel: float | None = None
     #: What opacities are multiplied with, by the places of Gaussians; None: nothing.
     fade: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]] | None = None
-    #: By which the tree keeps what has faded so.
+    #: By which these are kept.
     fade_name: str = ""
     #: Of a leaf only those anchors are put together that a view may show, and they alone are places: most of a leaf is
     #: beside a small part of a view.
@@ -89,8 +89,8 @@ class LodScene:
         return replace(self, pixel=pixel)
 
     def with_fade(self, factors: Callable[[Float[Tensor, "p 3"]], Float[Tensor, " p"]], name: str) -> LodScene:
-        """The same scene, opacities multiplied with these; those of 0 are left out, and anchors with no other. The tree
-        keeps what it has faded by `name`."""
+        """The same scene, opacities multiplied with these, which are kept by `name`. Anchors and nodes that have wholly
+        faded out are left out."""
         return replace(self, fade=factors, fade_name=name, _anchors={}, _nodes={})
 
     def cost(self, camera: Camera) -> int:
@@ -99,7 +99,7 @@ class LodScene:
 
     @torch.no_grad()
     def view_splats(self, camera: Camera, image_index: int | None = None) -> tuple[Int64[Tensor, " m"], Splats]:
-        """The splats of a view, and to which of `places` each belongs."""
+        """The splats of a view, and to which of the places of `values` each belongs."""
         cut = self._cut(camera)
         assemble = partial(self._assemble_anchors, camera=camera)
         anchors = assemble(cut.leaves) if self.culls_leaves else _held(self._anchors, cut.leaves, assemble)
@@ -124,13 +124,12 @@ class LodScene:
         if cut.leaves:
             found.append(self._leaf_values(cut.leaves, camera, of))
         if cut.nodes:
-            found += [self._node_values(node, of) for node in cut.nodes]
+            found += [self._node_values(node, of) for node in cut.nodes if not _are_zero(self._node_factors(node))]
         return torch.cat(found) if found else torch.zeros(0)
 
     def _node_values(self, node: int, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
-        """Values of the merged Gaussians of a node, none where all have faded out."""
-        values = of(("nodes", node), lambda: self.tree.gaussians(node).means)
-        return values[:0] if _are_zero(self._node_factors(node)) else values
+        """Values of the merged Gaussians of a node."""
+        return of(("nodes", node), lambda: self.tree.gaussians(node).means)
 
     def _node_factors(self, node: int) -> Float[Tensor, " m"] | None:
         """What the opacities of the merged Gaussians of a node are multiplied with; None: nothing."""
@@ -202,8 +201,12 @@ class LodScene:
 
     def _read_nodes(self, nodes: tuple[int, ...]) -> list[FadedNode]:
         """The nodes of which something is drawn."""
-        read = side_by_side(lambda node: FadedNode(self.tree.gaussians(node), self._node_factors(node)), nodes)
-        return [node.to(self.device) for node in read if not _are_zero(node.factors)]
+        read = side_by_side(self._faded_node, nodes)
+        return [node.to(self.device) for node in read if node is not None]
+
+    def _faded_node(self, node: int) -> FadedNode | None:
+        factors = self._node_factors(node)
+        return None if _are_zero(factors) else FadedNode(self.tree.gaussians(node), factors)
 
 
 def _are_zero(factors: Tensor | None) -> bool:

@@ -30,8 +30,8 @@ from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_format import TREE_FILE
 from vdgs.model.lod_nodes import LodTable, anchors_file, load_anchors, load_node, node_file
 
-#: Nodes, and what scenes make of them, are kept in memory up to so many bytes.
-CACHE_BYTES = 192 << 20
+#: Nodes are kept mapped up to so many bytes: a picture at rest of the viewer takes up to 290 MB of them.
+CACHE_BYTES = 320 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25
 #: What drawing an anchor costs, in merged Gaussians: it is decoded, and shows about six of its ten (measured).
@@ -66,7 +66,7 @@ class LodTree:
 
     @property
     def cached_bytes(self) -> int:
-        """Memory that the cached nodes take."""
+        """What the cached nodes take of their files."""
         return self._cache.bytes
 
     def errors_px(self, camera: Camera) -> Float[np.ndarray, " t"]:
@@ -155,22 +155,14 @@ class LodTree:
         other._cache = NodeCache(cache_bytes)
         return other
 
-    def keep(self, key: tuple[str, int], make: Callable[[], _Content], size: Callable[[_Content], int]) -> _Content:
-        """What is kept by a key, or is made; `size` in bytes. What was used longest ago goes first."""
-        return self._cache.get(key, make, size)
-
     def gaussians(self, node: int) -> NodeGaussians:
         """The merged Gaussians of a node as its file has them: places in full, all else in half precision."""
-        return self.keep(("nodes", node), lambda: self.load(node), content_bytes)
-
-    def load(self, node: int) -> NodeGaussians:
-        """Those, read anew and not kept."""
-        return load_node(node_file(self.folder, node))
+        return self._cache.get(("nodes", node), lambda: load_node(node_file(self.folder, node)), content_bytes)
 
     def anchors(self, leaf: int) -> tuple[Anchors, Tensor]:
         """The anchors of a leaf, and their rows in the model, ascending."""
         file = anchors_file(self.folder, leaf)
-        return self.keep(("anchors", leaf), lambda: load_anchors(file), lambda content: content_bytes(content[0]))
+        return self._cache.get(("anchors", leaf), lambda: load_anchors(file), lambda content: content_bytes(content[0]))
 
     def anchors_of(
         self, leaves: tuple[int, ...], drawn: Callable[[int], tuple[Anchors, Tensor]]
@@ -192,7 +184,7 @@ def side_by_side(drawn: Callable[[int], _Content], nodes: tuple[int, ...]) -> li
 
 @cache
 def _readers(count: int) -> ThreadPoolExecutor:
-    """Threads that read nodes, kept: to begin some for each part of a picture takes longer than many a part."""
+    """Threads that read nodes. They are kept: to start them for each part of a picture takes a tenth of its time."""
     return ThreadPoolExecutor(count, "vdgs-reader")
 
 

@@ -85,7 +85,9 @@ def read_tensors_unchecked(path: Path) -> dict[str, Tensor]:
 def map_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """All tensors and the metadata of a file that `write_tensors` wrote, mapped into memory in place of read: nothing
     is copied, and the system takes pages back where memory is short. Changes to the tensors do not reach the file.
-    Raises OSError, ValueError or KeyError for other files."""
+    A file may be renamed, replaced or removed meanwhile, but whoever makes it shorter ends this process (SIGBUS).
+    Raises OSError, RuntimeError where it cannot be mapped, and ValueError, LookupError, TypeError or AttributeError for
+    other files."""
     size = path.stat().st_size
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")

@@ -61,7 +61,7 @@ class ImageComparison:
         """The error against the photograph nearest to `full_camera`, as its part `camera` sees it; NaN where that
         photograph does not show the point, or is masked."""
         error_map = self._cached_error_map(name, nearest_view_index(self._scene, full_camera))
-        depth = render(self._scene.shown(name), camera, depth=True).median_depth
+        depth = render(self._scene.shown(name, full_camera), camera, depth=True).median_depth
         assert depth is not None
         return _reproject_error(error_map, camera, depth.cpu().numpy())
 
@@ -78,7 +78,7 @@ class ImageComparison:
         view = self._scene.capture.views[index]
         camera, exposures = view.camera.limit_size(_MAX_COMPARE_PX), self._scene.exposures(name)
         photograph = resize_area(self._scene.images.get(index), camera.width, camera.height)
-        raster = render(self._scene.shown(name), camera, depth=True)
+        raster = render(self._scene.shown(name, camera), camera, depth=True)
         assert raster.median_depth is not None
         drawn = raster.image.cpu().numpy()
         if exposures is not None:

@@ -83,8 +83,9 @@ class Painter:
             from vdgs.rendering import scalar_maps
 
             capture = self._scene.capture
-            shown = self._scene.shown(self._scene.shown_name(display.model))
-            depth = scalar_maps.render_depth(shown, full_camera.limit_size(_PREVIEW_PX))
+            small = full_camera.limit_size(_PREVIEW_PX)
+            shown = self._scene.shown(self._scene.shown_name(display.model), small)
+            depth = scalar_maps.render_depth(shown, small)
             depth_range = scalar_maps.depth_range([depth], camera_height(capture))
             self._depth = scalar_maps.depth_scale(depth_range, capture.ground.unit)
 

@@ -99,10 +99,14 @@ class ViewerScene:
             self._trees[name] = find_tree(self.get_run(name))
         return self._trees[name]
 
-    def shown(self, name: str) -> Drawable:
-        """What single pixels and comparisons are drawn from: the tree at its finest but for the anchors far away."""
+    def shown(self, name: str, view: Camera | None = None) -> Drawable:
+        """What single pixels are drawn from: the tree at its finest but for the anchors far away; and what all of a
+        view is compared by: as finely as at rest."""
         tree = self.tree(name)
-        return self.model(name) if tree is None else tree.at_error(REST_ERROR_PX)
+        if tree is None:
+            return self.model(name)
+        finest = tree.at_error(REST_ERROR_PX)
+        return finest if view is None else finest.within(view, REST_MAX_COST)
 
     def get_level(
         self, name: str, camera: Camera, max_anchors: int | None = None, *, full_camera: Camera | None = None,

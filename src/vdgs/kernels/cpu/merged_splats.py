@@ -37,7 +37,7 @@ def _draw(part: MergedGaussians, camera: Tensor, tensors: list[Tensor]) -> None:
     n, degree = len(means), math.isqrt(part.shN.shape[1] + 1) - 1
     shapes = [(n, 3), (n, 3), (n, 4), (n,), (n, 3), (n, num_sh_bases(degree) - 1, 3), (n,), (n,), (n,), (n, 3)]
     found = [tuple(tensor.shape) for tensor in (means, *others)]
-    if found != shapes or len(factors) not in (0, n):
+    if found != shapes or (part.opacity_factors is not None and tuple(factors.shape) != (n,)):
         raise ValueError(f"merged Gaussians must be {shapes}, not {found}, with {n} factors or none")
     native, columns = extension.get_extension(), [*others, factors]
     if all(tensor.dtype == torch.float16 for tensor in columns):

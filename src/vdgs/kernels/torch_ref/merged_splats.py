@@ -32,7 +32,7 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera, before: Spla
     A splat is as much more transparent as the blur of a pixel enlarges it (Mip-Splatting, eq. 9): the blur that a model
     has learnt is part of its merged Gaussians. One that covers several times as much as itself is drawn as so many
     behind each other; members that are too small to be drawn are not among these (`shown_members`), and its color is
-    that of the others. Numbers in half precision are taken in the precision of the means. Not differentiable.
+    that of the others. Computed in float64, given in the precision of the means. Not differentiable.
     """
     g = _joined(parts)
     degree = math.isqrt(g.shN.shape[1] + 1) - 1
@@ -45,21 +45,23 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera, before: Spla
     colors = eval_sh_colors(g.sh0 + larger[:, None] * g.sh0_log_weight_cov, g.shN, _directions(g.means, camera), degree)
     # 1 - (1 - share) ** covers, and with the layers that are left.
     layers = g.covers * torch.log1p(-shares)
-    opacities = g.opacity_factors * g.opacity_logits.sigmoid()
-    whole, thinned = (opacities * -torch.expm1(layers * left) for left in (1.0, shown))
+    whole, thinned = (
+        g.opacity_factors * g.opacity_logits.sigmoid() * -torch.expm1(layers * left) for left in (1.0, shown)
+    )
     # What the rasterizer cuts off this splat itself has been counted with its members.
     drawn = torch.minimum(whole, thinned + ALPHA_MIN)
-    found = Splats(seen.means_px, seen.conics, seen.depths, colors, torch.where(seen.valid & (shown > 0), drawn, 0))
+    opacities = torch.where(seen.valid & (shown > 0), drawn, 0)
+    found = Splats(*(t.to(parts[0].means) for t in (seen.means_px, seen.conics, seen.depths, colors, opacities)))
     if before is None:
         return found
     return Splats(*(torch.cat([getattr(before, name), getattr(found, name)]) for name in SPLAT_TENSORS))
 
 
 def _joined(parts: Sequence[MergedGaussians]) -> MergedGaussians:
-    """All parts together, in the precision of their means, with factors."""
+    """All parts together, in float64, with factors: differences of numbers that are nearly equal are taken."""
     ones = torch.ones_like
     whole = [p if p.opacity_factors is not None else p._replace(opacity_factors=ones(p.covers)) for p in parts]
-    return MergedGaussians(*(torch.cat(column).to(parts[0].means.dtype) for column in zip(*whole, strict=True)))  # type: ignore[type-var]
+    return MergedGaussians(*(torch.cat(column).double() for column in zip(*whole, strict=True)))  # type: ignore[type-var]
 
 
 def _directions(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
@@ -84,15 +86,13 @@ def shown_members(
     c = t exp(s² / 2 - m) N(d - s), d = (m - log t) / s, N the standard normal distribution. Right to 0.002. The mean of
     (log w - m) / s² over what is drawn is c / (N(d) - c).
     """
-    # In double precision: far down the slope the two terms nearly cancel.
-    mean, given_std, depths = (tensor.double() for tensor in (log_weight_mean, log_weight_std, depths))
     pixels = torch.ones_like(depths) if camera.model == "orthographic" else depths**2
     least = (ALPHA_MIN * DILATION_PX2 / (camera.fx * camera.fy) * pixels).clamp_min(LEAST_WEIGHT).log()
-    std = given_std.clamp(*LOG_STDS)
-    below = least - mean
+    std = log_weight_std.clamp(*LOG_STDS)
+    below = least - log_weight_mean
     distance = (-below / std).clamp_min(-MAX_STDS)
-    cut = (below + std**2 / 2).exp() * torch.special.ndtr(distance - std)
+    # Far down the slope one is huge and the other tiny.
+    cut = (below + std**2 / 2 + torch.special.log_ndtr(distance - std)).exp()
     shown = (torch.special.ndtr(distance) - cut).clamp(0, 1)
     larger = torch.minimum(cut / shown.clamp_min(LEAST_WEIGHT), MAX_STDS / std)
-    dtype = log_weight_mean.dtype
-    return torch.where(distance > -MAX_STDS, shown, 0).to(dtype), larger.to(dtype)
+    return torch.where(distance > -MAX_STDS, shown, 0), larger

@@ -32,7 +32,7 @@ struct SplatRows {
   float *means_px, *conics, *depths, *colors, *opacities;
 };
 
-// As `torch_ref.merged_splats.LOG_STDS` and `MAX_STDS`, which are checked against these.
+// As `LOG_STDS`, `MAX_STDS` and `LEAST_WEIGHT` of torch_ref.merged_splats.
 constexpr float kLeastStd = 1e-2f, kMostStd = 3.0f, kMaxStds = 6.0f, kLeastWeight = 1e-30f;
 
 // e^(x^2) erfc(x) for x >= 0: t e^p(t) with t = 1 / (1 + x / 2). Fitted by Chebyshev's polynomials to 3e-6 of itself.
@@ -78,11 +78,14 @@ VDGS_INLINE Shown shown_members(F16 mean, F16 given_std, F16 least) {
   return {zero_unless(gt(distance, splat(-kMaxStds)), shown), larger};
 }
 
-// -log(1 - a) for 0 <= a <= 1; Kahan's way to keep small ones right.
-VDGS_INLINE F16 depth_of(F16 a) {
-  const F16 left = splat(1.0f) - a, lost = splat(1.0f) - left;
-  const F16 depth = (splat(0.0f) - log(max(left, splat(kLeastWeight)))) * (a / lost);
-  return select(gt(lost, splat(0.0f)), depth, a);
+// -log(1 - share), from 1 - share^2 as well: either is right where the other is lost to rounding. Kahan's way for small
+// shares.
+VDGS_INLINE F16 depth_of(F16 share, F16 rest) {
+  const F16 one = splat(1.0f), zero = splat(0.0f);
+  const F16 left = one - share, lost = one - left;
+  const F16 small = select(gt(lost, zero), (zero - log(max(left, splat(kLeastWeight)))) * (share / lost), share);
+  const F16 large = zero - log(max(rest / (one + share), splat(kLeastWeight)));
+  return select(lt(share, splat(0.5f)), small, large);
 }
 
 // 1 - e^-a for a >= 0.
@@ -117,7 +120,7 @@ VDGS_INLINE void colors_of(const MergedRows<Number>& rows, int64_t first, const 
   for (int c = 0; c < 3; ++c) color[c] = max(color[c], splat(0.0f));
 }
 
-// Whether some of sixteen may reach the image: as `cull` finds out of anchors, but to the last pixel that is drawn.
+// Whether some of sixteen may show in a pixel: the test of `cull`, whose three standard deviations are too few here.
 VDGS_INLINE bool some_in_sight(const Camera& camera, const F16 (&m)[3], const F16 (&s)[3]) {
   Sight<F16> sight = sight_of(camera, into_camera(camera, Vec3<F16>{m[0], m[1], m[2]}));
   sight.least = splat(kReachSquared / 9.0f) * sight.least;
@@ -155,7 +158,8 @@ void draw_sixteen(const MergedRows<Number>& rows, const Camera& camera, int64_t 
   const F16 faded = weight_mean[0] + log(max(factor[0], splat(kLeastWeight)));
   const Shown shown = shown_members(faded, weight_std[0], log(max(least, splat(kLeastWeight))));
   colors_of<degree>(rows, first, camera, gaussian.mean, shown.larger, color);
-  const F16 layers = covers[0] * depth_of(share), opacity = factor[0] * sigmoid(logit[0]);
+  const F16 rest = p.dilation * (p.variance_x + p.variance_y - p.dilation) * p.inverse_determinant;
+  const F16 layers = covers[0] * depth_of(share, rest), opacity = factor[0] * sigmoid(logit[0]);
   const F16 drawn = min(opacity * opacity_of(layers), fma(opacity, opacity_of(layers * shown.share), splat(kAlphaMin)));
 
   const auto if_valid = [&](F16 a) { return zero_unless(p.valid, a); };
