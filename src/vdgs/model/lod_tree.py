@@ -30,7 +30,7 @@ from vdgs.model.gaussians import NodeGaussians
 from vdgs.model.lod_format import TREE_FILE
 from vdgs.model.lod_nodes import LodTable, anchors_file, load_anchors, load_node, node_file
 
-#: Nodes are kept mapped up to so many bytes: a picture at rest of the viewer takes up to 290 MB of them.
+#: Nodes are kept mapped up to so many bytes: a picture at rest of the viewer takes up to 280 MB of them.
 CACHE_BYTES = 320 << 20
 #: The least distance of a camera from a node, as a part of the node's side.
 MIN_DISTANCE = 0.25

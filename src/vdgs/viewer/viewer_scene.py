@@ -35,7 +35,7 @@ from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility
 ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
 #: (choice: about a second on two cores, reading included).
-REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.2, 1.0, 4_400_000
+REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.2, 1.0, 4_250_000
 #: A view at rest is then drawn from all anchors, in parts that show about so many: a part takes about 50 ms on two
 #: cores (measured). Leaves take so much memory meanwhile.
 PART_MAX_ANCHORS, PART_CACHE_BYTES = 20_000, 128 << 20

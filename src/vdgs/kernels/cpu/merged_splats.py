@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from itertools import accumulate
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,8 +41,9 @@ def _draw(part: MergedGaussians, camera: Tensor, tensors: list[Tensor]) -> None:
     if found != shapes or (part.opacity_factors is not None and tuple(factors.shape) != (n,)):
         raise ValueError(f"merged Gaussians must be {shapes}, not {found}, with {n} factors or none")
     native, columns = extension.get_extension(), [*others, factors]
+    # As arrays of numpy: to hand tensors over takes as long again as all else of a small call.
     if all(tensor.dtype == torch.float16 for tensor in columns):
-        draw, columns = native.merged_splats_of_halves, [t.contiguous().view(torch.uint16) for t in columns]
+        draw, arrays = native.merged_splats_of_halves, [t.contiguous().numpy().view(np.uint16) for t in columns]
     else:
-        draw, columns = native.merged_splats, [contiguous(tensor) for tensor in columns]
-    draw(contiguous(means), *columns, camera, degree, *tensors)
+        draw, arrays = native.merged_splats, [contiguous(tensor).numpy() for tensor in columns]
+    draw(contiguous(means).numpy(), *arrays, camera.numpy(), degree, *(tensor.numpy() for tensor in tensors))
