@@ -170,6 +170,28 @@ def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
     assert any("gives no altitude for 0.jpg" in note for note in found.notes)
 
 
+@pytest.mark.parametrize(("altitude", "said"), [("{0}", ""), ("{1}", "450 m below"), ("{2}", "60 m above")])
+def test_altitudes_of_a_table_that_are_not_those_of_the_photographs_are_said(tmp_path, altitude, said):
+    seen = [replace(photo, lat_lon=(-33.5, -70.6 + k / 1e4), altitude=500.0 + k)
+            for k, photo in enumerate(photographs(tmp_path, NAMES))]  # fmt: skip
+    rows = [f"{photo.name},-33.5,{photo.lat_lon[1]},{altitude}".format(500 + k, 50 + k, 560 + k)
+            for k, photo in enumerate(seen)]  # fmt: skip
+    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt", *rows]))
+    notes = read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)).notes
+    assert any(said in note and "those in the photographs" in note for note in notes) is bool(said)
+
+
+def test_altitudes_of_a_table_that_are_those_of_the_photographs_in_feet_are_refused(tmp_path):
+    seen = [replace(photo, lat_lon=(-33.5, -70.6 + k / 1e4), altitude=500.0 + k)
+            for k, photo in enumerate(photographs(tmp_path, NAMES))]  # fmt: skip
+    rows = [f"{photo.name},-33.5,{photo.lat_lon[1]},{photo.altitude / 0.3048}" for photo in seen]
+    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt", *rows]))
+    with pytest.raises(CaptureError, match=r"gps\.csv: its altitudes are in feet"):
+        read_gps_priors(seen, tmp_path / "gps.csv", (1, 2))
+    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt_ft", *rows]))
+    assert read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)).origin[2] == pytest.approx(501.5, abs=1)
+
+
 def test_positions_without_any_altitude_count_in_the_plane(tmp_path):
     seen = [replace(photo, relative_altitude=None) for photo in photographs(tmp_path, NAMES)]
     (tmp_path / "gps.csv").write_text("name,lat,lon\n" + "".join(f"{k}.jpg,-33.5{k},-70.6\n" for k in range(4)))

@@ -132,6 +132,16 @@ def write_gps(file, scene, origin=ORIGIN, noise=0.0, wrong=()):
     return file
 
 
+def at_several_heights():
+    """The scene with each camera up to 8 m higher or lower."""
+    scene = tiny_scene()
+    for k, (name, camera) in enumerate(scene.cameras.items()):
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ np.array([0.0, 0.0, 4.0 * (k % 5 - 2)])
+        scene.cameras[name] = replace(camera, camera_from_world=pose)
+    return scene
+
+
 @pytest.mark.parametrize("wrong", [(), (2, 7)])
 def test_gps_gives_meters_and_east_north_up(tmp_path, wrong):
     """Names match across extensions and case; positions that are wrong by 400 m are left out."""
@@ -174,6 +184,33 @@ def test_gps_without_altitudes_places_in_the_plane(tmp_path):
     assert any("has no altitudes" in warning for warning in warnings)
     offset = truth.points - frame.to_ground(world.points)
     assert np.ptp(offset, axis=0).max() < 1  # turned by less than what the views are off by
+
+
+def table_of(file, scene, altitude_of):
+    """A table of the cameras' positions, with altitudes that are a function of the true ones."""
+    header, *rows = write_gps(file, scene).read_text(encoding="utf-8").splitlines()
+    cells = [row.split(",") for row in rows]
+    file.write_text("\n".join([header, *(",".join([*c[:-1], repr(altitude_of(float(c[-1])))]) for c in cells)]))
+    return file
+
+
+@pytest.mark.parametrize("altitude", [0.0, 120.0])
+def test_altitudes_that_are_one_number_say_nothing_of_heights(tmp_path, altitude):
+    truth = at_several_heights()
+    gps = table_of(tmp_path / "gps.csv", truth, lambda true: altitude)
+    frame, warnings = ground_of(truth, tmp_path, gps=gps)
+    assert frame.metric
+    assert frame.origin_geo[2] == 0
+    assert "up" not in frame.accuracy
+    assert any("heights count from the median point" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1 / 0.3048, "feet"), (0.3048, "metres")])
+def test_altitudes_in_feet_are_told_by_the_cameras(tmp_path, factor, unit):
+    truth = at_several_heights()
+    gps = table_of(tmp_path / "gps.csv", truth, lambda true: factor * true)
+    with pytest.raises(CaptureError, match=rf"gps\.csv: its altitudes are in {unit}"):
+        ground_of(truth, tmp_path, gps=gps)
 
 
 def test_moments_of_a_drone_place_a_finished_capture(tmp_path):

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.gps_tables import GpsRow, check_geodetic, read_gps_table, with_altitudes
+from vdgs.captures.gps_altitudes import with_altitudes, without_zero_altitudes
+from vdgs.captures.gps_tables import GpsRow, check_geodetic, read_gps_table
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.errors import CaptureError
 
@@ -89,14 +90,15 @@ def _by_number(names: Sequence[str]) -> _Find:
 
 def match_gps(names: Sequence[str], file: Path) -> tuple[np.ndarray, np.ndarray, bool]:
     """Indices [m] of the images that a table has a position of, the positions [m, 3] (latitude, longitude, altitude),
-    and whether their altitudes are known (0 where not).
+    and whether their altitudes are known (0 where not; where all are exactly 0, too).
 
     Raises `CaptureError` as `read_gps_table` and `match_rows` do.
     """
     table = read_gps_table(file)
     found = match_rows(names, table.rows, file, table.numbered)
-    positions = np.array([row.position for row in found.values()]).reshape(-1, 3)
-    kept, has_altitudes = with_altitudes(positions[:, 2], np.ones(len(positions), bool))
+    positions, every = np.array([row.position for row in found.values()]).reshape(-1, 3), np.ones(len(found), bool)
+    positions = without_zero_altitudes(positions, every)
+    kept, has_altitudes = with_altitudes(positions[:, 2], every)
     positions = np.where([True, True, has_altitudes], positions, 0.0)
     return np.array(list(found), int)[kept], positions[kept], has_altitudes
 

@@ -381,14 +381,6 @@ def _moments(lines: Sequence[Line], file: Path) -> GpsTable:
     return GpsTable(tuple(rows), numbered=True, notes=notes)
 
 
-def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Which of the `known` positions [n] bool are used, and whether their altitudes [n] are: the positions with an
-    altitude; where most positions have none, all positions, in the plane alone."""
-    finite = known & np.isfinite(altitudes)
-    enough = finite.sum() >= min(3, known.sum()) and 2 * finite.sum() >= known.sum()
-    return (finite, True) if enough else (known, False)
-
-
 def check_geodetic(position: tuple[float, ...], file: Path, where: str = "") -> None:
     """Raise CaptureError for what is no place on Earth; an altitude may be NaN."""
     latitude, longitude, altitude = position

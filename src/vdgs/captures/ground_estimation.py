@@ -25,9 +25,10 @@ import numpy as np
 from vdgs.captures.camera_height import view_distance
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
 from vdgs.captures.georeference import Georef, match_gps, read_georef
+from vdgs.captures.gps_altitudes import refuse_unit, wrong_unit
 from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import Problem, Up, fit_positions
+from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import by_axis
 from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.up_axis import estimate_up, up_by_views
@@ -45,6 +46,8 @@ FAR_FROM_ORIGIN_M = 1000.0
 MAX_ENU_DISTANCE_M = 50_000.0
 #: A told up axis farther than this from the estimated one is worth a warning.
 MAX_UP_DEVIATION_DEG = 30.0
+#: Cameras whose heights differ by more than this (metres) tell altitudes in feet from those in metres.
+LEAST_RELIEF_M = 3.0
 AXES = {
     sign + name: factor * np.eye(3)[index]
     for index, name in enumerate("xyz")
@@ -190,6 +193,30 @@ def _georeferenced(scene: _Scene, georef: Georef, name: str, warnings: list[str]
     return _shifted(frame, shift, how) if shift.any() else frame
 
 
+def _fit_table(problem: Problem, altitudes: np.ndarray, file: Path, warnings: list[str]) -> PositionFit:
+    """The fit of a table's positions with what its altitudes [n] are good for, which it says where they do not tell up.
+
+    Altitudes that are all one number, where the cameras' heights differ, are those of a program that knew none: they do
+    not even say how high the place lies. Raises CaptureError where the cameras tell that altitudes are in feet.
+    """
+    fit = fit_positions(problem)
+    if fit.altitude in ("unused", "drifts"):
+        heights = fit.placed[:, 2]
+        spread = heights - np.median(heights)
+        if np.ptp(heights) > LEAST_RELIEF_M:
+            refuse_unit(wrong_unit(altitudes - np.median(altitudes), spread), "the cameras", file)
+        if not np.ptp(altitudes):
+            warnings.append(
+                f"{file.name}: its altitudes are all {altitudes[0]:g} m, but the cameras' heights differ by "
+                f"{np.ptp(heights):.0f} m: left out; up is by the views, heights count from the median point."
+            )
+            return fit_positions(replace(problem, has_altitudes=False))
+        warnings.append(f"{file.name}: its altitudes drift or are of no use, and were left out; up is by the views.")
+    elif fit.altitude == "none":
+        warnings.append(f"{file.name}: it has no altitudes; up is by the views, heights count from the median point.")
+    return fit
+
+
 def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
     """The frame with its origin moved; the axes stay those of the first origin."""
     assert frame.origin_geo is not None
@@ -222,16 +249,12 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
             "minus sign of south or west missing? Mend the table, or leave --gps out."
         )
-    fit = fit_positions(problem)
+    fit = _fit_table(problem, geodetic[:, 2], file, warnings)
     refused = fit.why_refused(file.name)
     if refused:
         warnings.append(f"{file.name}: {refused}; it is ignored and the frame is estimated.")
         return None
-    similarity, inliers = fit.similarity, fit.inliers
-    if fit.altitude == "none":
-        warnings.append(f"{file.name}: it has no altitudes; up is by the views, heights count from the median point.")
-    elif fit.altitude != "used":
-        warnings.append(f"{file.name}: its altitudes drift or are of no use, and were left out; up is by the views.")
+    similarity, inliers, has_altitudes = fit.similarity, fit.inliers, fit.altitude != "none"
     if not inliers.all():
         names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.georeference import match_rows
-from vdgs.captures.gps_tables import GpsRow, read_gps_table, with_altitudes
+from vdgs.captures.gps_altitudes import refuse_unit, with_altitudes, without_zero_altitudes, wrong_unit
+from vdgs.captures.gps_tables import GpsRow, read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
 from vdgs.sfm.flights import STEP_M, flights_of
@@ -24,8 +25,9 @@ OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
 SAME_FLIGHT_DEG = 0.05
 #: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
 MIN_SPREAD_M = 2.0
-#: An altitude of exactly 0 among others that are farther from it (metres) is a default (choice).
-FAR_FROM_ZERO_M = 30.0
+#: Altitudes of a table that lie so far from those of the photographs (metres) are told: as far as a datum is off in few
+#: places, and nearer than heights over the ground are to those over the sea (choice).
+TOLD_ALTITUDE_M = 20.0
 #: What altitudes are measured from where none is known.
 ALTITUDE_UNKNOWN = "not recorded; 0 is that of the median point"
 #: What altitudes may be rounded to (metres; feet among them), and from how many positions on that is told; their error
@@ -165,7 +167,7 @@ def _in_space_or_plane(
     geodetic: np.ndarray, known: np.ndarray, names: Sequence[str], notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Positions [n, 3], which are used [n] bool, and whether with their altitudes (0 where not); says so in notes."""
-    geodetic = _without_single_zeros(geodetic, known)
+    geodetic = without_zero_altitudes(geodetic, known)
     kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
     if not has_altitudes:
         notes.append(
@@ -192,6 +194,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
         if not np.isfinite(row.position[2]):
             geodetic[index, 2], kinds[index] = _altitude_beside(photographs[index])
     notes = [*read.notes, *_unmatched(read.rows, rows, table), *_far_off(geodetic, photographs, table)]
+    notes += _other_altitudes(rows, photographs, table)
     without = [index for index, row in rows.items() if not np.isfinite(row.position[2])]
     if without:
         chosen = np.isin(np.arange(len(names)), without)
@@ -211,15 +214,6 @@ def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageM
     kinds = ["above the take-off, by XMP" if known[k] else kind for k, kind in enumerate(recorded.kinds)]
     notes = ["EXIF has no altitudes, or exactly 0 (a default); heights over the take-off are used."]
     return _Recorded(geodetic, kinds, recorded.source, notes, {})
-
-
-def _without_single_zeros(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Positions without altitudes of exactly 0, where other altitudes are far from 0 or all are 0: a receiver without
-    altitude writes 0."""
-    zero, others = geodetic[:, 2] == 0, known & (np.nan_to_num(geodetic[:, 2]) != 0)
-    if not zero.any() or (others.any() and abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M):
-        return geodetic
-    return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
 
 
 def _far_off(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: Path) -> list[str]:
@@ -252,6 +246,24 @@ def _far_off(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: 
     return [
         f"{table.name}: its positions lie {np.median(away) / 1000:,.0f} km from those in the photographs, and are used "
         "all the same. Another system or zone, or x and y exchanged?"
+    ]
+
+
+def _other_altitudes(rows: Mapping[int, GpsRow], photographs: Sequence[ImageMetadata], table: Path) -> list[str]:
+    """What to say of a table whose altitudes are not near those in the photographs. Raises CaptureError where they are
+    those in feet."""
+    pairs = np.array([(row.position[2], _or_nan(photographs[index].altitude)) for index, row in rows.items()])
+    given, own = pairs.reshape(-1, 2)[np.isfinite(pairs.reshape(-1, 2)).all(axis=1)].T
+    if len(own) < MIN_POSITIONS or not given.any() or not own.any():
+        return []
+    refuse_unit(wrong_unit(given, own), "those of the photographs", table)
+    off = float(np.median(given - own))
+    if abs(off) < TOLD_ALTITUDE_M:
+        return []
+    way = "above" if off > 0 else "below"
+    return [
+        f"{table.name}: its altitudes lie {abs(off):,.0f} m {way} those in the photographs, "
+        "and are used all the same. Over the ground, or over another zero, as that of the ellipsoid?"
     ]
 
 

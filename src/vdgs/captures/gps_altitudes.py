@@ -1,0 +1,53 @@
+"""Which altitudes of positions are believed: not those of exactly 0, which programs write that know none, and not those
+in feet that are said to be metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.table_columns import FOOT_M
+from vdgs.errors import CaptureError
+
+#: An altitude of exactly 0 among others that are farther from it (metres) is a default (choice).
+FAR_FROM_ZERO_M = 30.0
+#: Altitudes are the same but for their unit where they differ by less than this share of the heights (choice).
+SAME_HEIGHT = 0.1
+
+
+def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Which of the `known` positions [n] bool are used, and whether their altitudes [n] are: the positions with an
+    altitude; where most positions have none, all positions, in the plane alone."""
+    finite = known & np.isfinite(altitudes)
+    enough = finite.sum() >= min(3, known.sum()) and 2 * finite.sum() >= known.sum()
+    return (finite, True) if enough else (known, False)
+
+
+def without_zero_altitudes(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Positions [n, 3] without altitudes of exactly 0 (NaN in their place), where other altitudes of the `known`
+    positions [n] bool are far from 0 or all are 0."""
+    zero, others = geodetic[:, 2] == 0, known & (np.nan_to_num(geodetic[:, 2]) != 0)
+    if not zero.any() or (others.any() and abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M):
+        return geodetic
+    return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
+
+
+def wrong_unit(altitudes: np.ndarray, heights: np.ndarray) -> str:
+    """ "feet" where altitudes [n] that are said to be metres are the `heights` [n] in feet, "metres" the other way
+    around, empty where neither holds."""
+    size = float(np.median(np.abs(heights)))
+    for factor, unit in ((1 / FOOT_M, "feet"), (FOOT_M, "metres")):
+        if size > 0 and float(np.median(np.abs(altitudes / factor - heights))) < SAME_HEIGHT * size:
+            return unit
+    return ""
+
+
+def refuse_unit(unit: str, whose: str, file: Path) -> None:
+    """Raise CaptureError if a table's altitudes are in another `unit` than it says, as `whose` tell."""
+    if unit:
+        other = "metres" if unit == "feet" else "feet"
+        raise CaptureError(
+            f"{file}: its altitudes are in {unit} and are taken for {other}, as {whose} tell. Convert them, or name "
+            "their unit in the heading (alt_ft, alt_m)."
+        )
