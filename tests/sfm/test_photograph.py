@@ -297,6 +297,15 @@ def test_outputs_among_photographs_are_refused(tmp_path):
     assert not is_image_folder(tmp_path / "card")  # a capture that lacks something is told so
 
 
+@pytest.mark.parametrize("output", ["full", "full/thesis.txt"])
+def test_a_look_refuses_the_outputs_that_the_work_refuses(tmp_path, output):
+    flight(tmp_path / "card")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.txt").write_text("three years")
+    with pytest.raises(VdgsError, match=r"holds other things|is a file"):
+        plan_reconstruction(SfmRequest(image_folders=(tmp_path / "card",), output=tmp_path / output))
+
+
 # -------------------------------------------------------------------------------------------- look and plan
 
 
