@@ -50,6 +50,8 @@ class ImageReport:
     name: str
     residual_m: tuple[float, ...] | None = None
     excluded_reason: str | None = None
+    file: str | None = None
+    """The own name of one that is left out, where that in the capture is another."""
 
 
 @dataclass(frozen=True)
@@ -275,5 +277,7 @@ def gcp_table(metadata: ReconstructionReport) -> list[tuple[str, str, str, str, 
 def excluded_lines(metadata: ReconstructionReport) -> list[str]:
     """Photographs that are not used, each with the reason."""
     return [
-        f"{photo.name}: {photo.excluded_reason}" for photo in metadata.photographs if photo.excluded_reason is not None
+        f"{photo.file or photo.name}: {photo.excluded_reason}"
+        for photo in metadata.photographs
+        if photo.excluded_reason is not None
     ]
