@@ -122,6 +122,8 @@ def test_columns_of_heights_are_named_in_tables_of_any_system(tmp_path):
         ("\0\1\2\3\0\0\0\0", "is not a text file.*save a spreadsheet as CSV"),
         ("EPSG:4326\n-70.6 -33.5 500 100 200 a.jpg P1\n", "control points is given as --gcp"),
         ("time,latitude,longitude,altitude\n1,-33.5,-70.6,5\n", "no column of photographs' names.*exiftool -geotag"),
+        ("ID,Lat,Lon\n7,-33.5,-70.6\n", r"photographs' names \(found: ID, Lat, Lon\)\. Call the column .* `name`"),
+        ("Image ID,Lat,Lon\n7,-33.5,-70.6\n", r"photographs' names \(found: Image ID, Lat, Lon\)\. Call the column"),
         ('<?xml version="1.0"?>\n<gpx><trkpt lat="1" lon="2"/></gpx>', "is a track.*exiftool -geotag"),
         ("<?xml version='1.0'?><kml><coordinates>-70.6,-33.5,500</coordinates></kml>", "is a track"),
         ("<?xml version='1.0'?><gpx>" + "<trkpt/>" * 20_000 + "</gpx>", "is a track"),
@@ -139,6 +141,39 @@ def test_tables_that_are_none_are_refused_with_the_line(tmp_path, text, said):
     file.write_text(text)
     with pytest.raises(CaptureError, match=said):
         read_gps_table(file)
+
+
+@pytest.mark.parametrize("number", ["", "ID,7", "No,7", "fid,7"])
+@pytest.mark.parametrize(
+    ("column", "name"),
+    [
+        ("Image ID", "a"), ("PhotoID", "DJI_0001"), ("photo_filename", "a"), ("Source image", "a"), ("Foto", "0001"),
+        ("影像名称", "a"), ("Beauty shot", "a.JPG"), ("what", r"D:\card\a.dng"),
+    ],
+)  # fmt: skip
+def test_columns_of_names_are_known_by_heading_or_by_what_they_hold(tmp_path, number, column, name):
+    """Numbers of rows are no names, whatever they are called."""
+    heading, _, value = number.partition(",")
+    rows = f"{heading},{column},Lat,Lon\n{value},{name},-33.5,-70.6\n"
+    (file := tmp_path / "table.csv").write_text(rows)
+    (row,) = read_gps_table(file).rows
+    assert (row.name, row.position[:2]) == (name, PLACE[:2])
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        ("照片名称,纬度,经度,高度\n张a.jpg,-33.5,-70.6,500\n", "gb18030"),
+        ("照片名称,lat,lon,alt\n张a.jpg,-33.5,-70.6,500\n", "gbk"),
+        ("Dateiname;Breitengrad;Längengrad;Höhe\nüa.jpg;-33,5;-70,6;500\n", "cp1252"),
+        ("name,lat,lon,alt\nüöa.jpg,-33.5,-70.6,500\n", "cp1252"),
+    ],
+)
+def test_tables_of_spreadsheets_that_write_no_unicode_are_read(tmp_path, text, encoding):
+    (file := tmp_path / "table.csv").write_bytes(text.encode(encoding))
+    (row,) = read_gps_table(file).rows
+    assert (row.name[-5:], row.position) == ("a.jpg", PLACE)
+    assert row.name in text
 
 
 NAMES = [f"{k}.jpg" for k in range(4)]

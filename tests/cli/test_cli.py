@@ -270,6 +270,12 @@ def test_a_short_help_ends_a_clause_where_it_makes_sense(capsys):
     assert "(default: on; off: --no-ortho)" in help_of(capsys, "run", "--help")
 
 
+def test_no_explanation_of_the_short_help_breaks_off():
+    for kind in filter(None, verb_arguments().values()):
+        for option in options_of(kind):
+            assert not option.summary(68).endswith((",", ":", "(")), option.flag
+
+
 def test_a_word_of_an_option_is_refused_with_words_that_may_stand_there():
     program = next(each for each in options_of(ExportArguments) if each.flag == "--for")
     with pytest.raises(ValueError, match=r"^ros: must be supersplat or .* or unity$"):

@@ -281,6 +281,22 @@ def test_numbers_that_are_none_leave_no_file(tmp_path, name):
     assert (tmp_path / name).read_text() == "before"
 
 
+@pytest.mark.parametrize("name", [each.suffix if each.folder else f"a{each.suffix}" for each in registry.FORMATS])
+def test_only_files_of_ours_may_be_written_over(tmp_path, name):
+    """Those of an earlier export are known by what they say, or what lies beside them."""
+    path = tmp_path / name
+    for free in (None, b""):
+        if free is not None:
+            path.write_bytes(free)
+        registry.check_not_foreign(path)
+    path.write_bytes(b"ply\nformat ascii 1.0\ncomment of somebody else\n")
+    with pytest.raises(VdgsError, match="is there already and was not written by vdgs"):
+        registry.check_not_foreign(path)
+    path.unlink()
+    registry.write_scene(path, ExportScene.of(random_gaussians(20, 1)))
+    registry.check_not_foreign(path)
+
+
 def test_scenes_that_are_not_what_they_announce_are_refused(tmp_path):
     some = random_gaussians(20, 1)
     with pytest.raises(ValueError, match="21 Gaussians were announced, 20 came"):

@@ -271,6 +271,11 @@ def test_a_look_writes_nothing_into_the_output(flight: Path, tmp_path: Path):
         assert len(collect_images([folder]).images) > 3
     assert not folder.exists()
     assert not (tmp_path / "out").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.txt").write_text("three years")
+    look = temporary_frames(ask(tmp_path / "full", flight), Console(file=io.StringIO()))
+    with pytest.raises(VdgsError, match="holds other things"), look:
+        pass
 
 
 def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vdgs.captures import reconstruction
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
@@ -255,6 +257,22 @@ def test_stated_accuracy_wins_over_what_views_say_of_up():
     assert fit.altitude == "used"
     assert tilt_deg(fit, turn) < 0.1
     assert fit.place_error_m[0] < 0.1
+
+
+def test_small_drifts_of_a_receiver_with_rtk_are_said_with_their_digits():
+    """Altitudes that sink by 18 cm where all else is good to 1 cm: a drift, and not one of "-0 m"."""
+    rng = np.random.default_rng(2)
+    places = strips(4, 8, 20.0, rng)
+    recorded = places + rng.normal(0, 0.01, places.shape)
+    recorded[:, 2] -= 0.18 * np.linspace(0, 1, len(places))
+    fit = fit_positions(problem_of(places, recorded, 2)[0])
+    assert fit.altitude == "drifts"
+    (note,) = georegistration._of_altitudes(fit, barometer=False)
+    drift, good = map(float, re.search(r"drift by ([+-][\d.]+) m .* good to ±([\d.]+) m", note).groups())
+    assert drift == pytest.approx(fit.drift_m, rel=0.05)
+    assert good == pytest.approx(fit.place_error_m[1], rel=0.05)
+    accuracy = georegistration.accuracy_of(fit, recorded, SimpleNamespace(has_altitudes=True))
+    assert f"altitudes drift by {drift} m" in dict(reconstruction._accuracy_rows(accuracy))["Positions are good to"]
 
 
 def test_positions_that_are_another_flights_are_left_out():

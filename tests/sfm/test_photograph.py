@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -15,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, WIDTH, add_xmp, write_photograph
+from vdgs.captures.reconstruction import excluded_lines
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -32,6 +34,7 @@ from vdgs.sfm.image_metadata import (
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
+from vdgs.sfm.reconstruction_report import _photographs
 from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -253,7 +256,7 @@ def test_what_is_not_used_is_named_with_its_reason(tmp_path):
     flight(tmp_path)
     (tmp_path / "notes.txt").write_text("a flight")
     (tmp_path / "copy.jpg").write_bytes((tmp_path / "p03.jpg").read_bytes())
-    (tmp_path / "p04.png").write_bytes((tmp_path / "p05.jpg").read_bytes() + b"\0")
+    (tmp_path / "p04.png").write_bytes((tmp_path / "p04.jpg").read_bytes() + b"\0")
     (tmp_path / "cut.jpg").write_bytes((tmp_path / "p02.jpg").read_bytes()[:4000])
     found = collect_images([tmp_path])
     reasons = {each.name: each.reason for each in found.excluded}
@@ -261,6 +264,56 @@ def test_what_is_not_used_is_named_with_its_reason(tmp_path):
     assert "copy of copy.jpg" in reasons["p03.jpg"]
     assert "another ending" in reasons["p04.png"]
     assert (len(found.images), found.other_files) == (6, 1)
+
+
+def test_what_is_left_out_is_called_by_its_own_name(tmp_path):
+    """By that of the capture nobody finds the file; in the report of the finished capture neither."""
+    flight(tmp_path)
+    (tmp_path / "p00 again.jpg").write_bytes((tmp_path / "p00.jpg").read_bytes())
+    found = collect_images([tmp_path])
+    assert [each.line for each in found.excluded] == ["p00 again.jpg: is a copy of p00.jpg"]
+    assert any("p00_again.jpg is 'p00 again.jpg'" in note for note in found.notes)
+    photographs = _photographs(found, positions_of(found.images), None, ())
+    assert excluded_lines(SimpleNamespace(photographs=photographs)) == [each.line for each in found.excluded]
+
+
+def test_photographs_of_one_name_are_told_apart_by_moment_and_place(tmp_path):
+    """Other endings: both are used where both were taken. Other cases: many disks hold one of the two alone."""
+    flight(tmp_path)
+    for name, other in (("p01.jpeg", "p02.jpg"), ("p03.png", "p03.jpg")):
+        (tmp_path / name).write_bytes((tmp_path / other).read_bytes() + b"\0")
+    (tmp_path / "P05.jpg").write_bytes((tmp_path / "p04.jpg").read_bytes() + b"\0\0")
+    if len(list(tmp_path.iterdir())) < 9:
+        pytest.skip("this file system tells no cases apart")
+    found = collect_images([tmp_path])
+    reasons = {each.name: each.reason for each in found.excluded}
+    assert sorted(reasons) == ["p03.png", "p05.jpg"]
+    assert "name of p03.jpg with another ending" in reasons["p03.png"]
+    assert "P05.jpg but for upper and lower case" in reasons["p05.jpg"]
+    assert "rename" in reasons["p05.jpg"]
+    assert {"p01.jpg", "p01.jpeg"} <= {photo.name for photo in found.images}
+
+
+def test_links_to_what_is_not_there_are_said(tmp_path):
+    flight(tmp_path / "disk", 5)
+    links = tmp_path / "links"
+    links.mkdir()
+    for number, file in enumerate(sorted((tmp_path / "disk").iterdir())):
+        (links / file.name).symlink_to(file if number < 3 else tmp_path / "unmounted" / file.name)
+    (links / "DCIM").symlink_to(tmp_path / "unmounted/DCIM")
+    (links / ".#p00.jpg").symlink_to("me@here.1234")  # an editor's lock
+    found = collect_images([links])
+    assert len(found.images) == 3
+    (note,) = (note for note in found.notes if "not there" in note)
+    assert note.startswith("left out 3 links to files that are not there (first DCIM, to")
+    (links / "p00.jpg").unlink()
+    with pytest.raises(CaptureError, match=r"2 photographs that can be used;[^$]*left out 3 links"):
+        collect_images([links])
+    for name in ("p01.jpg", "p02.jpg"):
+        (links / name).unlink()
+    assert is_image_folder(links)
+    with pytest.raises(CaptureError, match=r"holds no photographs .*left out 3 links to files that are not there"):
+        collect_images([links])
 
 
 def test_folders_are_told_apart(tmp_path):
@@ -295,6 +348,15 @@ def test_outputs_among_photographs_are_refused(tmp_path):
     assert is_image_folder(tmp_path / "card")
     (tmp_path / "card/sparse").mkdir()
     assert not is_image_folder(tmp_path / "card")  # a capture that lacks something is told so
+
+
+@pytest.mark.parametrize("output", ["full", "full/thesis.txt"])
+def test_a_look_refuses_the_outputs_that_the_work_refuses(tmp_path, output):
+    flight(tmp_path / "card")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.txt").write_text("three years")
+    with pytest.raises(VdgsError, match=r"holds other things|is a file"):
+        plan_reconstruction(SfmRequest(image_folders=(tmp_path / "card",), output=tmp_path / output))
 
 
 # -------------------------------------------------------------------------------------------- look and plan

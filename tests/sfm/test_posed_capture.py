@@ -36,6 +36,7 @@ from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.sfm import feature_extraction, feature_matching
 from vdgs.sfm.posed_capture import make_posed_capture
 from vdgs.sfm.posed_photographs import _in_metres, read_posed_photographs
+from vdgs.sfm.posed_plan import plan_posed_capture
 from vdgs.sfm.random_points import random_points
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]  # whole reconstructions, runs or trainings
@@ -206,6 +207,15 @@ def test_photographs_of_other_poses_are_refused(town_flight: tuple[Path, KnownFl
     project_writers.write_realityscan_csv(root / "cameras.csv", replace(flight, names=flight.names[::-1]))
     with pytest.raises(CaptureError, match="agree with the poses"):
         ask(root, tmp_path / "capture")
+
+
+def test_a_look_refuses_an_output_that_the_work_refuses(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
+    root, flight = _some_photographs(town_flight, tmp_path)
+    project_writers.write_realityscan_csv(root / "cameras.csv", flight)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.txt").write_text("three years")
+    with pytest.raises(VdgsError, match="holds other things"):
+        plan_posed_capture(SfmRequest(image_folders=(root,), output=tmp_path / "full"), CaptureOptions())
 
 
 # ------------------------------------------------------------------------------------- data sets without points

@@ -7,7 +7,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vdgs.system.units import ABSENT, clock, count, data_size, duration, rough_duration
+from vdgs.system.units import ABSENT, clock, count, data_size, duration, rough_duration, two_digits
 
 
 def test_figures_that_are_not_there_are_a_dash():
@@ -37,3 +37,16 @@ def test_a_size_is_right_to_its_last_digit(n_bytes):
     number, unit = re.fullmatch(r"([\d,.]+) ([MG]B)", data_size(n_bytes)).groups()
     shown = float(number.replace(",", "")) * {"MB": 1e6, "GB": 1e9}[unit]
     assert abs(shown - n_bytes) <= max(0.5e6, 0.01 * n_bytes)
+
+
+@given(value=st.floats(-1e5, 1e5))
+def test_two_digits_of_a_measure_are_right_and_keep_its_sign(value):
+    shown = two_digits(value, "+")
+    assert abs(float(shown) - value) <= max(0.051 * abs(value), 0.0005)
+    assert "e" not in shown
+    assert shown[0] == ("-" if float(shown) < 0 else "+")
+
+
+def test_small_and_large_measures_as_people_read_them():
+    said = {0.18: "0.18", -0.04: "-0.040", 9.96: "10", 7.3: "7.3", 119.6: "120", 4321.0: "4321", -0.0001: "0"}
+    assert {value: two_digits(value) for value in said} == said

@@ -27,7 +27,17 @@ from vdgs.captures.coordinate_systems import (
     names_a_system,
     to_geodetic,
 )
-from vdgs.captures.table_columns import ANGLES, NO_DATA, RADIANS, UNKNOWN, known_columns, meters_of, number_of
+from vdgs.captures.table_columns import (
+    ANGLES,
+    NO_DATA,
+    RADIANS,
+    UNKNOWN,
+    has_time,
+    known_columns,
+    meters_of,
+    number_of,
+    with_names,
+)
 from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
 from vdgs.errors import CaptureError
 
@@ -164,13 +174,13 @@ def _after_colon(text: str) -> str:
 
 def _is_header(line: Line) -> bool:
     """Whether a line that begins like a comment names the columns (Metashape, RealityScan)."""
-    words = rows_of([Line(line.number, line.text.lstrip("# "))])[0].words
-    return {"name"} < set(known_columns(words))
+    known = known_columns(rows_of([Line(line.number, line.text.lstrip("# "))])[0].words)
+    return len(known) > 1 and ("name" in known or "id" in known)
 
 
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
-    known = known_columns(rows[0].words)
+    known = with_names(known_columns(rows[0].words), [row.words for row in rows[1:]])
     unit = meters_of(rows[0].words[known["alt"]]) if "alt" in known else 1.0
     others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
     heights = (rows[0].words[known["alt"]], *others) if others else ()
@@ -184,7 +194,9 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         datum = system if system is not None and _is_datum(system, file) else None
         return _Columns(known, datum, unit, heights=heights, deviation_units=units, across_units=angles), rows[1:]
     if {"lat", "lon"} <= set(known):
-        raise CaptureError(f"{file}: has positions but no column of photographs' names: it is {_BY_TIME}")
+        found = ", ".join(word for word in rows[0].words if word)
+        remedy = f"It is {_BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
+        raise CaptureError(f"{file}: has positions but no column of photographs' names (found: {found}). {remedy}")
     if {"name", "x", "y"} <= set(known):
         if system is None and "system" in known and len(rows) > 1:
             k = known["system"]

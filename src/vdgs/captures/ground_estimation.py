@@ -37,6 +37,7 @@ from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import geometric_median, is_collinear, rotation_to_z
+from vdgs.system.units import two_digits
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
 NOMINAL_CAMERA_HEIGHT = 10.0
@@ -260,7 +261,11 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
     axes = slice(3 if has_altitudes else 2)
     rms = float(np.sqrt((fit.residuals[inliers, axes] ** 2).sum(axis=1).mean()))
-    place = by_axis(fit.place_error_m if has_altitudes else fit.place_error_m[:1], ("across", "up"), "±{:.2g}")
+    place = by_axis(
+        fit.place_error_m if has_altitudes else fit.place_error_m[:1],
+        ("across", "up"),
+        lambda good: f"±{two_digits(good)}",
+    )
     method = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
     accuracy = f"place {place}, scale ±{fit.scale_error:.2%} (95 %)"
     how = f"{method}; {accuracy}"

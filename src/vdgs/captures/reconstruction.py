@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json, read_json_or_empty
 from vdgs.system.records import record_from_dict
+from vdgs.system.units import two_digits
 
 RECONSTRUCTION_FILE, RECONSTRUCTION_FIGURE = "reconstruction.json", "reconstruction.png"
 #: The model as the photographs alone give it, with their lenses: what positions and control points place.
@@ -48,6 +50,8 @@ class ImageReport:
     name: str
     residual_m: tuple[float, ...] | None = None
     excluded_reason: str | None = None
+    file: str | None = None
+    """The own name of one that is left out, where that in the capture is another."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +93,9 @@ class AccuracyFacts:
         """One line for tables."""
         parts = []
         if self.place_m is not None:
-            parts.append(f"place {by_axis(self.place_m, ('across', 'up'), '±{:.2g}')}")
+            parts.append(f"place {by_axis(self.place_m, ('across', 'up'), lambda good: f'±{two_digits(good)}')}")
         if self.scale_percent is not None:
-            edge = f" (±{self.scale_m:.2g} m at the edge)" if self.scale_m is not None else ""
+            edge = f" (±{two_digits(self.scale_m)} m at the edge)" if self.scale_m is not None else ""
             parts.append(f"scale ±{self.scale_percent:.2g} %{edge}")
         parts += [f"north ±{self.north_deg:.2g}°"] if self.north_deg is not None else []
         parts += [f"level ±{self.level_deg:.2g}°"] if self.level_deg is not None else []
@@ -220,9 +224,13 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
     return rows
 
 
-def by_axis(values: tuple[float, ...], axes: tuple[str, ...] = ("east", "north", "up"), number: str = "{:.2f}") -> str:
+def by_axis(
+    values: tuple[float, ...],
+    axes: tuple[str, ...] = ("east", "north", "up"),
+    number: Callable[[float], str] = "{:.2f}".format,
+) -> str:
     """Metres along each axis, with the names of the axes; without the last where no altitudes are known."""
-    return ", ".join(f"{number.format(value)} m {axis}" for value, axis in zip(values, axes, strict=False))
+    return ", ".join(f"{number(value)} m {axis}" for value, axis in zip(values, axes, strict=False))
 
 
 def _accuracy_rows(accuracy: AccuracyFacts) -> list[tuple[str, str]]:
@@ -230,13 +238,13 @@ def _accuracy_rows(accuracy: AccuracyFacts) -> list[tuple[str, str]]:
     if accuracy.positions_m is not None:
         words = {
             "none": "; no altitudes",
-            "drifts": f"; altitudes drift by {accuracy.altitude_drift_m:+.0f} m, left out",
+            "drifts": f"; altitudes drift by {two_digits(accuracy.altitude_drift_m, '+')} m, left out",
             "unused": "; altitudes are of no use, left out",
         }.get(accuracy.altitude, "")
         if accuracy.altitude_offsets_m:
-            over = ", ".join(f"{off:+.0f} m" for off in accuracy.altitude_offsets_m)
+            over = ", ".join(f"{two_digits(off, '+')} m" for off in accuracy.altitude_offsets_m)
             words = f"; altitudes of flights differ by {over}, left out{words}"
-        found = f"{by_axis(accuracy.positions_m, number='{:.2g}')} (one standard deviation, by the flight itself)"
+        found = f"{by_axis(accuracy.positions_m, number=two_digits)} (one standard deviation, by the flight itself)"
         rows.append(("Positions are good to", f"{found}{words}"))
     return rows
 
@@ -269,5 +277,7 @@ def gcp_table(metadata: ReconstructionReport) -> list[tuple[str, str, str, str, 
 def excluded_lines(metadata: ReconstructionReport) -> list[str]:
     """Photographs that are not used, each with the reason."""
     return [
-        f"{photo.name}: {photo.excluded_reason}" for photo in metadata.photographs if photo.excluded_reason is not None
+        f"{photo.file or photo.name}: {photo.excluded_reason}"
+        for photo in metadata.photographs
+        if photo.excluded_reason is not None
     ]

@@ -5,15 +5,24 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
+
+from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 
 #: What each column is called, once blanks, signs, accents, units and the case of letters are taken away.
 _COLUMNS: dict[str, frozenset[str]] = {
     what: frozenset(names.split())
     for what, names in {
         "name": "name label image imagename imagefile imagefilename filename file sourcefile photo photoname "
-        "photograph picture picturename img imgname path filepath imagepath cameraname photolabel "
-        "dateiname bildname bild nombre imagen fichier nomdufichier nomefile 照片名称 文件名 名称",
+        "photograph picture picturename img imgname path filepath imagepath cameraname photolabel imagelabel "
+        "photofilename photofile photopath picturefile picturefilename imgfile imgfilename sourceimage sourcefilename "
+        "originalname originalfilename rawfilename rawname imagenames filenames "
+        "dateiname bildname bild bilddatei foto fotos fotoname nombre imagen archivo nombrearchivo nombreimagen "
+        "nombrefoto fichier nomdufichier nomfichier nomimage nomphoto nomefile nomefoto immagine "
+        "照片名称 照片名 照片 文件名 文件名称 名称 影像名称 影像名 图像名称 图片名称",
+        "id": "imageid photoid photographid pictureid imgid picid cameraid frameid shotid bildid fotoid idphoto "
+        "idimage idfoto 照片id 影像id",
         "lat": "lat latitude gpslatitude gpslat ylatitude latitudey latitudedeg latdeg wgs84lat wgs84latitude "
         "latitudewgs84 ylat cameralatitude originallatitude breite breitengrad latitud latitudine 纬度",
         "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
@@ -44,6 +53,10 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "system": "epsg crs srs epsgcode csname coordinatesystem",
     }.items()
 }  # fmt: skip
+#: How names of pictures end.
+_PICTURES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
+#: Names of columns of moments.
+_TIMES = re.compile(r"time|date|\butc|gpst|\btow\b|gpsweek|zeit|datum|hora|fecha|heure|时间|日期", re.IGNORECASE)
 _UNIT = re.compile(
     r"[\[(][^\])]*[\])]|[_ ](?:decimal degrees|dd|deg|degrees|rad(?:ians)?|[kcm]?m|met(?:er|re)s?"
     r"|(?:us[ _]?)?f(?:oo|ee)?t)$"
@@ -86,6 +99,26 @@ def known_columns(words: Sequence[str]) -> dict[str, int]:
         elif what is not None:
             found.setdefault(what, k)
     return found
+
+
+def with_names(known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[str, int]:
+    """The known columns of these rows of places, with that of photographs' names where no heading says which it is: one
+    of identifiers that are no plain numbers, else the first that holds names of pictures."""
+    if "name" in known or not {*known} & {"lat", "lon", "x", "y"}:
+        return dict(known)
+    places = {*known.values()} - {known.get("id")}
+    columns = [k for k in range(max(map(len, rows), default=0)) if k not in places]
+    for k in sorted(columns, key=lambda k: k != known.get("id")):
+        words = [row[k].strip() for row in rows if k < len(row) and row[k].strip()]
+        labels = k == known.get("id") and not all(math.isfinite(number_of(word)) for word in words)
+        if words and (labels or all(PurePosixPath(word).suffix.lower() in _PICTURES for word in words)):
+            return {**known, "name": k}
+    return dict(known)
+
+
+def has_time(words: Sequence[str]) -> bool:
+    """Whether one of these names of columns is that of moments."""
+    return any(_TIMES.search(word) for word in words)
 
 
 def meters_of(word: str) -> float:

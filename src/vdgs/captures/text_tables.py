@@ -6,9 +6,11 @@ import codecs
 import csv
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from vdgs.captures.table_columns import known_columns
 from vdgs.errors import CaptureError
 
 #: Larger files are no tables of photographs (bytes).
@@ -43,32 +45,58 @@ class Row(NamedTuple):
 
 
 def read_lines(file: Path, what: str = "table of photographs") -> list[Line]:
-    """The lines of a text file that are not empty, in UTF-8, UTF-16 or Windows' Latin. Raises CaptureError, which says
-    `what` is expected."""
+    """The lines of a text file that are not empty, in UTF-8, UTF-16, Windows' Latin, or GBK where that makes names of
+    columns known. Raises CaptureError, which says `what` is expected."""
     try:
         if file.stat().st_size > LONGEST_FILE:
             raise CaptureError(f"{file}: is far too large for a {what}.")
         data = file.read_bytes()
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
-    text = decode_text(data)
+    text = _decode_table(data)
     if "\x00" in text:
         raise CaptureError(f"{file}: is not a text file. A {what} is expected; save a spreadsheet as CSV.")
-    lines = [Line(k, line.strip(" \r")) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = _lines(text)
     return lines[1:] if lines and _EXCEL.fullmatch(lines[0].text) else lines
+
+
+def _lines(text: str) -> list[Line]:
+    return [Line(k, line.strip(" \r")) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+
+
+def _decode_table(data: bytes) -> str:
+    """A text as by `decode_text`, but as Excel writes it in China where more names of columns are known then."""
+    text = _decode_unicode(data)
+    if text is not None:
+        return text
+    latin = decode_text(data)
+    with suppress(UnicodeDecodeError):
+        return max(latin, data.decode("gb18030"), key=_known_names)  # the former where they are equal
+    return latin
+
+
+def _known_names(text: str) -> int:
+    """How many names of columns are known in the line that has most of them, of the first ones."""
+    head = _lines("\n".join(text.splitlines()[:LOOKED_AT]))
+    return max((len(known_columns(row.words)) for row in rows_of(head)), default=0)
 
 
 def decode_text(data: bytes) -> str:
     """A text in UTF-8, UTF-16 or Windows' Latin, as programs on Windows write it."""
+    text = _decode_unicode(data)
+    return data.decode("cp1252", errors="replace") if text is None else text
+
+
+def _decode_unicode(data: bytes) -> str | None:
+    """A text in UTF-8 or UTF-16; None where it is in neither."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     head = data[:400]
     if head and head[1::2].count(0) > len(head) // 4:
         return data.decode("utf-16-le", errors="replace")
-    try:
+    with suppress(UnicodeDecodeError):
         return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("cp1252", errors="replace")
+    return None
 
 
 def rows_of(lines: Sequence[Line]) -> list[Row]:

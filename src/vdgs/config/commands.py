@@ -194,7 +194,7 @@ class ExportRequest(ModelRequest):
     """A scene as files of Gaussians or points for other programs (`vdgs export`)."""
 
     output: Annotated[tuple[Path, ...], Repeatable(), Output()] = ()
-    """File to write; its ending is the format: .ply, .spz, .glb, .html, ... These are .ply (3DGS), .compressed.ply
+    """File to write; its ending (.ply, .spz, .glb, .html) is the format. All there are: .ply (3DGS), .compressed.ply
     (PlayCanvas), .spz, .splat, .sog, .rad (Spark), .glb (glTF), FOLDER/tileset.json (3D Tiles), FOLDER/lod-meta.json
     (streamed SOG), .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --output
     again for more: the scene is baked once (docs/export.md)."""

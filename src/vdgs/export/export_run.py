@@ -129,7 +129,7 @@ def _point(place: np.ndarray) -> tuple[float, float, float]:
 def resolve_request(request: ExportRequest) -> ExportRequest:
     """The request with its files named, checked before the run is opened, and the degree that they need.
 
-    Raises VdgsError for file names of no format and for outputs that are the run's report.
+    Raises VdgsError for file names of no format, and for outputs that are the run's report or that vdgs did not write.
     """
     request = with_files(request)
     _check_names(request)
@@ -268,6 +268,7 @@ def _check_names(asked: ExportRequest) -> None:
     for path in paths:
         axes_for(path, asked)
         check_output(path)
+        registry.check_not_foreign(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
                 f"--output {path}: is the report of the run, which would be overwritten, and written again over the "

@@ -43,7 +43,7 @@ def print_preflight(preflight: PreflightReport, collection: ImageList, plan: lis
     _table(rows, console)
     for warning in preflight.warnings:
         console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
-    _print_excluded([f"{each.name}: {each.reason}" for each in collection.excluded], console)
+    _print_excluded([each.line for each in collection.excluded], console)
 
 
 def print_reconstruction_report(report: ReconstructionReport, console: Console) -> None:

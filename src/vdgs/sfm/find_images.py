@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,12 +18,13 @@ from vdgs.captures.image_files import (
     readable_images,
     readable_suffixes,
 )
-from vdgs.captures.name_resolution import to_colmap_name
+from vdgs.captures.name_resolution import to_colmap_name, to_nfc
 from vdgs.captures.optional_decoders import INSTALL
 from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.strays import is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import check_is_text
+from vdgs.system.units import first_names
 
 #: Files beside a photograph that are no news.
 _SILENT = {".ds_store", "thumbs.db", "desktop.ini"}
@@ -43,6 +45,10 @@ class Found:
     """Photographs of kinds that are not read, by their suffix."""
     doubled: Counter[str] = field(default_factory=Counter)
     """HEIC and raw files beside a picture of the same name, by their suffix."""
+    dangling: list[Path] = field(default_factory=list)
+    """Links to what is not there."""
+    renamed: dict[str, str] = field(default_factory=dict)
+    """Images' own names, by those in the capture, where the two differ (blanks)."""
 
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
@@ -58,11 +64,30 @@ class Found:
             "folder of those alone."
             for kind, number in self.doubled.items()
         ]
+        notes += [f"{said}."] if (said := self.dangling_links()) else []
+        if self.renamed:
+            names = [f"{name} is {own!r}" for name, own in self.renamed.items()]
+            notes.append(f"names here have _ for blanks (and a # in front): {first_names(names)}.")
         for why in dict.fromkeys(self.skipped.values()):
             names = [name for name, reason in self.skipped.items() if reason == why]
             shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
             notes.append(f"not read: {shown} ({why}).")
         return notes
+
+    def dangling_links(self) -> str:
+        """What to tell of links to what is not there; empty where there are none."""
+        if not self.dangling:
+            return ""
+        first, count = self.dangling[0], len(self.dangling)
+        return (
+            f"left out {count} link{'s' if count > 1 else ''} to files that are not there (first {first.name}, to "
+            f"{os.readlink(first)}): connect the disk that they are on, or copy the files"
+        )
+
+
+def is_dangling(path: Path) -> bool:
+    """Whether a path is a link to what is not there: a file or a folder of a disk that is not connected."""
+    return path.is_symlink() and not os.path.exists(path)
 
 
 def is_photograph(path: Path) -> bool:
@@ -118,6 +143,8 @@ def find_files(folders: Sequence[Path]) -> Found:
 def _add(found: Found, path: Path, written: str, stems: set[str]) -> None:
     check_is_text(path)
     name = to_colmap_name(written)
+    if name != to_nfc(written):
+        found.renamed[name] = to_nfc(written)
     preview = previewed_stem(path.stem)
     if preview is not None and preview.lower() in stems:
         found.left_out[name] = "is a preview, by its name"
@@ -137,6 +164,10 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
     suffix = path.suffix.lower()
     if path.name.startswith("._") or path.name.lower() in _SILENT:
         return
+    if is_dangling(path):
+        if not path.name.startswith("."):  # editors' locks are such links
+            found.dangling.append(path)
+        return
     found.others += path.is_file()
     if suffix in OTHER_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
@@ -147,6 +178,8 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
 def nothing_found(folders: Sequence[Path], found: Found) -> CaptureError:
     """What to tell of folders without photographs that can be read."""
     said = f"{', '.join(map(str, folders))}: holds no photographs ({', '.join(sorted(IMAGE_SUFFIXES))})"
+    if dangling := found.dangling_links():
+        return CaptureError(f"{said}: {dangling}.")
     if found.unread:
         kinds = "; ".join(
             f"{_count(number, suffix)} not read: {_remedy(suffix)}" for suffix, number in found.unread.items()

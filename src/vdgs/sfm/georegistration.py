@@ -18,6 +18,7 @@ from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, untrust
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.lazy_pycolmap import pycolmap
+from vdgs.system.units import two_digits
 
 #: Attitudes that agree on which way a world lies, at least.
 MIN_ATTITUDES = 3
@@ -198,10 +199,16 @@ def _place_error(
 
 
 def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
-    over = [f"{off:+.0f} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different]
+    over = [
+        f"{two_digits(off, '+')} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different
+    ]
     up = fit.place_error_m[1]
     fixed = up < min(map(abs, offsets.different))  # by RTK alone (`_place_error`)
-    good = f"±{up:.2g} m above their own zero, be it the ellipsoid (RTK) or the sea" if fixed else f"±{up:.0f} m"
+    good = (
+        f"±{two_digits(up)} m above their own zero, be it the ellipsoid (RTK) or the sea"
+        if fixed
+        else f"±{two_digits(up)} m"
+    )
     return [
         f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?): {', '.join(over)} over "
         f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the "
@@ -227,20 +234,19 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
 
 
 def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
+    good = f"heights above the sea are only good to ±{two_digits(fit.place_error_m[1])} m."
     if barometer:
-        return [
-            "altitudes drift against the heights over the take-off, which are used in their place: heights above the "
-            f"sea are only good to ±{fit.place_error_m[1]:.0f} m."
-        ]
+        return [f"altitudes drift against the heights over the take-off, which are used in their place: {good}"]
     if fit.altitude == "drifts":
+        drift = two_digits(fit.drift_m, "+")
         return [
-            f"the recorded altitudes drift by {fit.drift_m:+.0f} m from the first photograph to the last: that is left "
-            f"out, and heights above the sea are only good to ±{fit.place_error_m[1]:.0f} m."
+            f"the recorded altitudes drift by {drift} m from the first photograph to the last: that is left out, and "
+            f"{good}"
         ]
     if fit.altitude == "unused":
         return [
-            f"the recorded altitudes are off by {fit.gps_std[2]:.3g} m from photograph to photograph: scale, north "
-            f"and up are found without them; heights above the sea are only good to ±{fit.place_error_m[1]:.0f} m."
+            f"the recorded altitudes are off by {two_digits(fit.gps_std[2])} m from photograph to photograph: scale, "
+            f"north and up are found without them; {good}"
         ]
     return []
 

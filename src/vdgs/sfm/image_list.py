@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 
+import numpy as np
+
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.image_files import HEIF_SUFFIXES
+from vdgs.captures.image_files import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from vdgs.captures.name_resolution import jpeg_name, match_key
 from vdgs.captures.nested_captures import check_no_foreign_file, foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
@@ -22,7 +24,7 @@ from vdgs.config.sfm_options import Brackets, CameraModel
 from vdgs.errors import CaptureError
 from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked, strays, unused_bands
-from vdgs.sfm.find_images import check_decoders, find_files, is_film, is_photograph, nothing_found
+from vdgs.sfm.find_images import check_decoders, find_files, is_dangling, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.rig_folders import with_sensors
@@ -34,6 +36,8 @@ from vdgs.system.units import first_names
 MIN_IMAGES = 3
 #: So many bytes at both ends of files of one size tell whether they are copies.
 _DIGEST_BYTES = 1 << 16
+#: Programs that convert photographs may round places by so much (about a metre; choice).
+_ROUNDED_DEG = 1e-5
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,13 @@ class ExcludedImage:
 
     name: str
     reason: str
+    file: str | None = None
+    """Its own name, where that in the capture is another."""
+
+    @property
+    def line(self) -> str:
+        """Both for people, who look for the file."""
+        return f"{self.file or self.name}: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -103,10 +114,13 @@ def collect_images(
     photographs, lone = _with_models([photo for photo in photographs if photo.name not in exposures], camera_model)
     photographs, rigs = with_sensors(photographs)
     left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
+    left_out = [replace(each, file=found.renamed.get(each.name)) for each in left_out]
     notes = [*found.notes(), *notes, *spectral, *bracketed, *rigs, *_kind_notes(photographs)]
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
-        reasons = format_list(f"{each.name}: {each.reason}" for each in left_out)
+        said = [each.line for each in left_out]
+        said += [dangling] if (dangling := found.dangling_links()) else []
+        reasons = format_list(said)
         raise CaptureError(
             f"{', '.join(map(str, folders))}: {len(photographs)} photograph{'s' if len(photographs) != 1 else ''} that "
             f"can be used; a scene needs {MIN_IMAGES} at the very least, and each place two or three that show "
@@ -128,9 +142,13 @@ def is_image_folder(folder: Path) -> bool:
         or (folder / "sparse").exists()
     ):
         return False
-    decoded = HEIF_SUFFIXES | RAW_SUFFIXES  # without their decoder the error of `collect_images` says what to install
+    # Without their decoder, or the disk that links lead to, the error of `collect_images` says what to do.
+    decoded = HEIF_SUFFIXES | RAW_SUFFIXES
     return any(
-        is_photograph(path) or is_film(path) or path.suffix.lower() in decoded
+        is_photograph(path)
+        or is_film(path)
+        or path.suffix.lower() in decoded
+        or (is_dangling(path) and path.suffix.lower() in IMAGE_SUFFIXES)
         for _, files, _ in walk(folder)
         for path in files
     )
@@ -189,24 +207,42 @@ def _read(path: Path, name: str, mask: Path | None) -> ImageMetadata | ExcludedI
 
 
 def _drop_duplicates(photographs: list[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
-    """Leave out copies of the same file, and files whose names differ in their endings only."""
+    """Leave out copies of the same file, the same photograph with another ending, and names that differ in upper and
+    lower case only."""
     kept, left_out = list[ImageMetadata](), list[ExcludedImage]()
     sizes = Counter(photo.file_bytes for photo in photographs)
-    contents, stems = dict[tuple[int, bytes], str](), dict[str, str]()
+    contents, stems = dict[tuple[int, bytes], str](), dict[str, list[ImageMetadata]]()
     for photo in photographs:
-        stem = match_key(photo.name)
-        if stem in stems:
-            left_out.append(ExcludedImage(photo.name, f"has the name of {stems[stem]} with another ending"))
+        content = (photo.file_bytes, _digest(photo.path)) if sizes[photo.file_bytes] > 1 else None
+        alike = stems.setdefault(match_key(photo.name), [])
+        if content in contents:
+            why = f"is a copy of {contents[content]}"
+        else:
+            why = next(filter(None, (_why_same(photo, other) for other in alike)), "")
+        if why:
+            left_out.append(ExcludedImage(photo.name, why))
             continue
-        if sizes[photo.file_bytes] > 1:
-            content = photo.file_bytes, _digest(photo.path)
-            if content in contents:
-                left_out.append(ExcludedImage(photo.name, f"is a copy of {contents[content]}"))
-                continue
+        if content is not None:
             contents[content] = photo.name
-        stems[stem] = photo.name
+        alike.append(photo)
         kept.append(photo)
     return kept, left_out
+
+
+def _why_same(photo: ImageMetadata, other: ImageMetadata) -> str:
+    """Why a photograph does not count beside another whose name differs in its ending and case alone; empty where both
+    were taken, at other moments or places, and their names can be told apart."""
+    if photo.name.lower() == other.name.lower():
+        return (
+            f"has the name of {other.name} but for upper and lower case, which many disks do not tell apart: rename "
+            "one of the two to use both"
+        )
+    moments, places = (photo.datetime, other.datetime), (photo.lat_lon, other.lat_lon)
+    apart = all(moments) and moments[0] != moments[1]
+    if places[0] is not None and places[1] is not None:
+        apart |= bool(np.abs(np.subtract(places[0], places[1])).max() > _ROUNDED_DEG)
+    one_mask = photo.mask is not None and photo.mask == other.mask  # which of the two is it of?
+    return "" if apart and not one_mask else f"has the name of {other.name} with another ending"
 
 
 def _digest(path: Path) -> bytes:

@@ -81,7 +81,7 @@ def make_posed_capture(
     if finished.is_done(CAPTURE, photographs.keys[CAPTURE]):
         console.print(f"{output}: made of these poses already; nothing to do", highlight=False)
         return
-    _check_output(output, work, finished, photographs.keys, request.overwrite)
+    check_posed_output(request, photographs.keys)
     check_nothing_trained(request, run)
     console.print(
         f"{len(photographs.views)} photographs, poses and lenses as they are; points are found",
@@ -103,8 +103,10 @@ def make_posed_capture(
         console.print(f"{model.num_points3D():,} points, mean reprojection error {error:.2f} px", highlight=False)
 
 
-def _check_output(output: Path, work: Workspace, finished: Workspace, keys: dict[str, str], overwrite: bool) -> None:
-    """Only a new folder, an empty one, or one that was begun with the same project is written to."""
+def check_posed_output(request: SfmRequest, keys: dict[str, str]) -> None:
+    """Raise VdgsError unless the output is a new folder, an empty one, or one that was begun with the same project."""
+    output = request.output
+    work, finished = Workspace(output / WORK_FOLDER), Workspace(output)
     check_output(output)
     if not output.exists() or (output.is_dir() and not any(each.name != ".lock" for each in output.iterdir())):
         return
@@ -112,7 +114,7 @@ def _check_output(output: Path, work: Workspace, finished: Workspace, keys: dict
     same = work.is_begun(FEATURES, keys[FEATURES]) or finished.is_begun(CAPTURE, keys[CAPTURE])
     if not begun:
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
-    if not same and not overwrite:
+    if not same and not request.overwrite:
         raise VdgsError(
             f"{output}: was begun with other photographs, poses or settings than there are now. Add --overwrite to "
             "make it anew, or choose another --output."

@@ -16,7 +16,7 @@ from vdgs.sfm.focal_length import Lens
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.posed_capture import near_pairs
+from vdgs.sfm.posed_capture import check_posed_output, near_pairs
 from vdgs.sfm.posed_photographs import PosedPhotographs, read_posed_photographs
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -27,9 +27,11 @@ MAPPING_SHARE = 0.2
 
 
 def plan_posed_capture(request: SfmRequest, options: CaptureOptions) -> tuple[ReconstructionPlan, SfmEstimate]:
-    """The work on a project of another program, by estimate. Raises what reading the project raises."""
+    """The work on a project of another program, by estimate. Raises what reading the project raises, and VdgsError for
+    an output that is something else."""
     check_ranges(request)
     photographs = read_posed_photographs(request, options)
+    check_posed_output(request, photographs.keys)
     images = ImageList(request.image_folders, tuple(_with_lenses(photographs)), (), 0, photographs.warnings)
     positions = _positions(photographs)
     plan = ReconstructionPlan(

@@ -45,7 +45,6 @@ from vdgs.sfm.reconstruction_plan import (
     POSITIONS_FIGURE,
     ReconstructionPlan,
     check_disk_space,
-    check_output_folder,
     plan_reconstruction,
     print_plan,
     time_order,
@@ -99,7 +98,6 @@ def reconstruct(
         if not request.keep_intermediate:
             work.remove()
         return facts
-    check_output_folder(output)
     check_unchanged(output, sources, request.overwrite)
     check_nothing_trained(request, run)
     before = _placed_before(output, keys["capture"])

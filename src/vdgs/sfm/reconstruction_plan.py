@@ -59,10 +59,12 @@ class ReconstructionPlan:
 
 
 def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
-    """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
+    """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one,
+    VdgsError for an output that is something else."""
     check_ranges(request)
     collection = collect_images(request.image_folders, request.options.camera_model, request.options.brackets)
     check_output_outside_images(request.output, collection)
+    check_output_folder(request.output)
     request, beside = _with_tables_beside(request, collection)
     _check_marks(request.options, collection)
     positions = read_gps_priors(collection.images, request.gps, request.options.gps_std_m)
@@ -170,7 +172,7 @@ def check_output_outside_images(output: Path, collection: ImageList) -> None:
 
 
 def check_output_folder(output: Path) -> None:
-    """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
+    """Raise VdgsError unless the output is a new folder, an empty one, or one of an earlier reconstruction."""
     if output.is_dir() and not is_reconstruction(output) and _has_foreign_files(output):
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
     if output.exists() and not output.is_dir():

@@ -182,7 +182,8 @@ def _photographs(
     if placed is not None:
         for row, residual in zip(placed.position_rows, placed.residuals, strict=True):
             residuals[collection.images[int(positions.image_indices[row])].name] = tuple(float(v) for v in residual)
-    return tuple(ImageReport(name, residuals.get(name), why.get(name)) for name in names)
+    files = {each.name: each.file for each in collection.excluded}
+    return tuple(ImageReport(name, residuals.get(name), why.get(name), files.get(name)) for name in names)
 
 
 def _warnings(

@@ -63,6 +63,13 @@ def format_length(value: float | None, unit: str) -> str:
     return f"{value * 100:.3g} cm" if unit == "m" and value < 1 else f"{value:.3g} {unit}"
 
 
+def two_digits(value: float, sign: str = "") -> str:
+    """0.18, 7.3, 120: a measure that is good to two digits, no finer than a thousandth; `+` shows its sign."""
+    shown = round(value, 3) + 0.0  # no -0
+    power = int(f"{shown:.1e}".partition("e")[2]) if shown and math.isfinite(shown) else 1
+    return f"{shown:{sign}.{min(3, max(0, 1 - power))}f}"
+
+
 def first_names(names: Sequence[str]) -> str:
     """a.jpg, b.jpg, c.jpg and 12 more."""
     more = len(names) - 3

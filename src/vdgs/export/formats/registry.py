@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
-from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate
+from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate, metadata_path
 from vdgs.export.formats.file_folders import FileFolder
 from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
@@ -24,6 +24,9 @@ from vdgs.export.formats.streamed_sog import LOD_FILE, LOD_FOLDER, check_lod_fol
 from vdgs.export.formats.tiles_3d import TILE_FOLDER, TILESET_FILE, check_tileset_folder, write_tiles
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.scratch import remove_leftovers
+
+#: What files that vdgs wrote say within so many bytes.
+_PROGRAM, _HEAD_BYTES = b"vdgs", 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +156,25 @@ def format_from_path(path: Path) -> ExportFormat:
             return each
     known = ", ".join(f"{each.suffix} ({each.description})" for each in FORMATS)
     raise VdgsError(f"{path}: no format is known by this name. Let it end in one of: {known}.")
+
+
+def check_not_foreign(path: Path) -> None:
+    """Raise VdgsError where a file stands at the path that says nowhere, nor its FILE.json, that vdgs wrote it."""
+    beside = [metadata_path(path)] if format_from_path(path).writes_metadata_file else []
+    try:
+        if not path.is_file() or not path.stat().st_size or any(map(_names_vdgs, (path, *beside))):
+            return
+    except OSError as error:
+        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}). Choose another name.") from error
+    raise VdgsError(f"{path}: is there already and was not written by vdgs. Choose another name, or remove the file.")
+
+
+def _names_vdgs(file: Path) -> bool:
+    """Whether the beginning of a file, in which every format names the program that wrote it, names this one."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return _PROGRAM in stream.read(_HEAD_BYTES)
 
 
 def check_export(path: Path, scene: ExportScene) -> None:

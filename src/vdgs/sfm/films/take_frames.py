@@ -65,10 +65,15 @@ class FilmRecord:
 
 @contextmanager
 def temporary_frames(request: SfmRequest, console: Console) -> Iterator[SfmRequest]:
-    """The request with frames in place of films, for a look that writes nothing into the output."""
+    """The request with frames in place of films, for a look that writes nothing into the output.
+
+    Raises CaptureError for films that cannot be read or show no way, VdgsError for an output that is something else.
+    """
     if not films_in(request.image_folders):
         yield request
         return
+    check_output(request.output)
+    check_output_folder(request.output)  # before the frames are taken, which lasts
     with tempfile.TemporaryDirectory(prefix="vdgs-frames-") as folder:
         yield replace(request, image_folders=_take(request, Path(folder), console))
 
