@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from support.captures import TinyScene, assert_sees_the_scene
@@ -100,3 +101,15 @@ def test_a_test_file_without_frames_is_none(tmp_path, both):
     (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": []}))
     with pytest.raises(CaptureError, match=r"transforms_train\.json: must hold a list 'frames'"):
         load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.5, 30.0])
+def test_scaled_cameras_are_the_same_cameras(tmp_path, both, scale):
+    """At 0.01 too, which is the scale of MatrixCity's rotations; a script may have scaled some only."""
+
+    def enlarge(frame: dict) -> None:
+        if int(Path(frame["file_path"]).stem) % 2:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([scale] * 3 + [1])).tolist()
+
+    change_files(tmp_path, enlarge)
+    assert_sees_the_scene(load_capture(tmp_path), both)

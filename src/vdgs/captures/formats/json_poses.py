@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import BROWN, BadPose, Intrinsics, check_intrinsics
+from vdgs.captures.formats.source_capture import BROWN, BadPose, Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.image_files import read_header
 from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
@@ -17,6 +17,12 @@ from vdgs.system.documents import JsonObject
 
 #: Camera axes: OpenGL (right, up, back) from OpenCV (right, down, forward); its own inverse.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+#: A rotation that is longer or shorter by more than this share is scaled; rounding makes less.
+_SCALED = 1e-3
+_UNSCALE = (
+    "The file is damaged or of another convention; if Blender wrote it, apply the scale of the camera and of what it "
+    "hangs on (Ctrl-A, Scale), and export again."
+)
 
 
 def read_capture_json(file: Path) -> JsonObject:
@@ -54,6 +60,18 @@ def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:
     result = np.eye(4)
     result[:3] = matrix[:3]
     return result
+
+
+def camera_motion(matrix: np.ndarray, file: Path, label: str) -> np.ndarray:
+    """World from camera [4, 4], a rigid motion with OpenCV's axes of the camera, of one with OpenGL's.
+
+    A scale of the rotation is divided out: Blender writes it where the camera object is scaled, and sees the same with
+    it. The place of the camera has no part in it. Raises `BadPose` where more than a scale is left.
+    """
+    matrix, scale = matrix.copy(), float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+    if scale > 0 and abs(scale - 1) > _SCALED:
+        matrix[:3, :3] /= scale
+    return to_rigid(matrix @ OPENGL_FROM_OPENCV, file, label, remedy=_UNSCALE)
 
 
 def axis_rotation(axis: int, degrees: float) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from vdgs.captures.capture import Split
 from vdgs.captures.formats.frame_photographs import FramePhotographs
 from vdgs.captures.formats.json_poses import (
-    OPENGL_FROM_OPENCV,
+    camera_motion,
     get_frames,
     parse_intrinsics,
     parse_matrix,
@@ -31,7 +31,6 @@ from vdgs.captures.formats.source_capture import (
     leave_out_bad_poses,
     one_view_each,
     refuse_many_missing,
-    to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.config.capture_options import CaptureOptions
@@ -96,7 +95,7 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views, both = _without_tested(views)
     views, warnings = one_view_each(views, root, bad), warnings + both
     warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
-    if len(scales) > 1:
+    if is_city and len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
     what = "MatrixCity's layout" if is_city else files[0][0].name
@@ -166,7 +165,7 @@ def _read_frame(
     if scaled:
         matrix[:3, :3] /= BLOCK_ROTATION
     name, image = found
-    pose = np.linalg.inv(to_rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
+    pose = np.linalg.inv(camera_motion(matrix, file, f"frame {label}"))
     common = {key: value for key, value in content.items() if key != "frames"}
     intrinsics = parse_intrinsics(frame, common, image, file)
     return SourceView(

@@ -251,7 +251,10 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     return intrinsics
 
 
-def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:
+def to_rigid(
+    matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3, *,
+    remedy: str = "The file is damaged or of another convention.",
+) -> np.ndarray:  # fmt: skip
     """A rigid motion [4, 4] float64 from one that is rigid up to rounding.
 
     The rotation is replaced by the nearest orthonormal one (SVD). Raises `CaptureError` if an entry is not
@@ -268,7 +271,7 @@ def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3
     elif np.linalg.det(matrix[:3, :3]) < 0:
         problem = "a pose that mirrors the world"
     if problem:
-        raise BadPose(f"{file}: {label} has {problem}. The file is damaged or of another convention.")
+        raise BadPose(f"{file}: {label} has {problem}. {remedy}")
     left, _, right = np.linalg.svd(matrix[:3, :3])
     result = np.eye(4)
     result[:3, :3] = left @ right
