@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from support import project_writers as writers
 from support.known_flight import (
@@ -197,6 +198,22 @@ def test_a_lens_of_visualsfm_that_folds_over_is_named(tmp_path: Path) -> None:
     [said] = [each for each in read(tmp_path, "visualsfm").warnings if "cannot be used" in each]
     assert "folds over" in said
     assert flight.names[0] in said
+
+
+@pytest.mark.parametrize("program", ["bundler", "visualsfm", "visualsfm FixedK"])
+def test_shrunk_photographs_are_told_by_the_pixels_of_a_file_without_sizes(tmp_path: Path, program: str) -> None:
+    """The focal length is that of the photographs that were aligned; photographs of half the size would be misread."""
+    flight = known_flight(MeasuredLens(radial=0.0, k=(0.0, 0.0, 0.0, 0.0)))
+    name, _, fixed = program.partition(" ")
+    file = getattr(writers, f"write_{name}")(tmp_path, flight)
+    if fixed:
+        file.write_text(file.read_text().replace("NVM_V3 \n", "NVM_V3 FixedK 700 400 700 300 0\n", 1))
+    flight.write_photographs(tmp_path / "images")
+    assert len(read(tmp_path, name).views) == len(flight.names)
+    for path in (tmp_path / "images").rglob("*.*"):
+        Image.new("RGB", (400, 300)).save(path)
+    with pytest.raises(CaptureError, match=r"photograph is 400x300: it is of another size\. Give the photographs that"):
+        read(tmp_path, name)
 
 
 @pytest.mark.parametrize("nested", [False, True])
