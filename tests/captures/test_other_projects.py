@@ -15,6 +15,8 @@ from PIL import Image
 from support import project_writers as writers
 from support.known_flight import (
     BentLens,
+    EquidistantLens,
+    FixedAtOneLens,
     KnownFlight,
     MeasuredLens,
     known_flight,
@@ -231,6 +233,23 @@ def test_openmvg_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, nes
 @pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 6), (1, 2, 8)])
 def test_meshroom_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, version: tuple[int, int, int]) -> None:
     writers.write_alicevision(tmp_path, flight, version)
+    flight.write_photographs(tmp_path / "images")
+    check_tie_points(read(tmp_path, "alicevision"), flight)
+
+
+@pytest.mark.parametrize(
+    ("lens", "told"),
+    [
+        (EquidistantLens(k=(0.0,) * 4, sensor=(36.0, 27.0), circle=300.0), {"type": "equidistant"}),
+        (EquidistantLens(k=(0.0,) * 4), {"type": "equidistant", "fisheyeCircleRadius": "280", "sensorHeight": "25"}),
+        (EquidistantLens(), {"type": "equidistant_r3", "fisheyeCircleRadius": "280", "sensorHeight": "25"}),
+        (EquidistantLens(sensor=(36.0, 27.0), circle=300.0), {"type": "equidistant", "distortionType": "radialk3pt"}),
+        (FixedAtOneLens(), {"type": "pinhole", "distortionType": "radialk3pt"}),
+    ],
+)
+def test_lenses_of_meshroom_are_read_to_their_numbers(tmp_path: Path, lens: BentLens, told: dict[str, str]) -> None:
+    flight = known_flight(lens)
+    writers.write_alicevision(tmp_path, flight, **told)
     flight.write_photographs(tmp_path / "images")
     check_tie_points(read(tmp_path, "alicevision"), flight)
 
