@@ -129,7 +129,6 @@ def patched(file: Path, offset: int, data: bytes) -> None:
         ("images.bin", 0, struct.pack("<Q", 1 << 60), "announced"),
         ("points3D.bin", 0, struct.pack("<Q", 1 << 60), "announced"),
         ("cameras.bin", 12, struct.pack("<i", 77), "camera 1: number 77 is no camera model that is supported"),
-        ("cameras.bin", 12, struct.pack("<i", 17), r"number 17 \(EQUIRECTANGULAR\) .* vdgs sfm IMAGES"),
         ("cameras.bin", 16, struct.pack("<Q", 0), "image size of 0x48"),
         ("cameras.bin", 16, struct.pack("<Q", 200_000), "image size of 200000x48"),
         ("cameras.bin", 32, struct.pack("<d", -50.0), "focal length"),
@@ -153,6 +152,32 @@ def test_silly_values_are_named(tmp_path, file, offset, data, message):
     with pytest.raises(CaptureError, match=message) as caught:
         read_colmap(folder, strict=one_pose)
     assert file.split(".")[0] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "camera", "message"),
+    [
+        (False, struct.pack("<IiQQ2d", 99, 17, 4000, 2000, 4000, 2000), r"17 \(EQUIRECTANGULAR\) .* vdgs sfm IMAGES"),
+        (False, struct.pack("<IiQQ4d", 99, 1, 0, 0, 50, 50, 0, 0), "camera 99 has an image size of 0x0"),
+        (True, b"99 EQUIRECTANGULAR 4000 2000 4000 2000\n", "'EQUIRECTANGULAR' with 2 parameters .* vdgs sfm IMAGES"),
+        (True, b"99 MINE 4000 2000 1 2 3\n", "'MINE' with 3 parameters is no camera model"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_matters_where_an_image_uses_it(tmp_path, text, camera, message):
+    folder = write_colmap(tmp_path, tiny_scene(), text=text, images=None)
+    file = folder / f"cameras{'.txt' if text else '.bin'}"
+    whole = file.read_bytes()
+    if not text:
+        whole = struct.pack("<Q", struct.unpack_from("<Q", whole)[0] + 1) + whole[8:]
+    file.write_bytes(whole + camera)
+    assert_same(read_colmap(folder), tiny_scene())
+    if text:
+        images = folder / "images.txt"
+        images.write_text(re.sub(r" \d+ (frame_000\.png)", r" 99 \1", images.read_text()))
+    else:
+        patched(folder / "images.bin", 68, struct.pack("<I", 99))
+    with pytest.raises(CaptureError, match=message):
+        read_colmap(folder)
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from support.captures import TinyScene, tiny_scene, write_colmap, write_images, write_ply
-from support.dataset_layouts import DRB, OPENGL, halves, write_matrixcity, write_mega_nerf
+from support.dataset_layouts import DRB, OPENGL, halves, write_blender, write_matrixcity, write_mega_nerf
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
 from vdgs.captures.loading import load_capture
@@ -341,6 +341,36 @@ def test_an_archive_is_called_a_file(tmp_path):
     (tmp_path / "place.zip").write_bytes(b"PK")
     with pytest.raises(CaptureError, match="of an archive, once it is unpacked"):
         load_capture(tmp_path / "place.zip")
+
+
+def test_a_part_of_a_capture_names_the_folder_of_it_all(tmp_path, scene):
+    """Files that people give instead: what their other programs open."""
+    write_colmap(tmp_path / "model", scene)
+    write_blender(tmp_path / "set", scene, scene)
+    parts = ["model/sparse/0/images.bin", "model/sparse/0/points3D.bin", "set/transforms_train.json"]
+    for part in parts:
+        root = tmp_path / part.split("/")[0]
+        with pytest.raises(CaptureError, match=rf"is a part of a capture\. Give the folder of it all: {root}$"):
+            load_capture(tmp_path / part)
+        assert len(load_capture(root, CaptureOptions(up="z")).views) >= len(scene.cameras)
+        with pytest.raises(CaptureError, match=rf"Give the folder of it all: {root}$"):
+            collect_images([tmp_path / part])
+
+
+def test_poses_by_another_name_than_transforms_json_say_what_to_call_them(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    (tmp_path / "transforms.json").rename(tmp_path / "mine.json")
+    for given in (tmp_path, tmp_path / "mine.json"):
+        with pytest.raises(CaptureError, match=r"mine\.json: .*rename it to transforms\.json, which is read"):
+            load_capture(given)
+
+
+def test_cameras_of_a_trained_scene_are_no_reconstruction(tmp_path):
+    """Neither by their folder (above) nor as a file: OpenSfM's is a list too."""
+    file = tmp_path / "cameras.json"
+    file.write_text('[{"id": 0, "img_name": "a", "width": 9, "position": [0, 0, 1], "fx": 900}]')
+    with pytest.raises(CaptureError, match=r"cameras\.json: is cameras of a trained 3DGS scene"):
+        load_capture(file)
 
 
 def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path, scene):

@@ -119,6 +119,16 @@ def test_an_image_of_another_shape_is_named_with_both_sizes(folder, scene):
         load_capture(folder, UP)
 
 
+def test_a_model_of_photographs_that_exif_turns_asks_for_upright_ones(folder, scene):
+    """COLMAP and others apply EXIF's orientation or do not, by version; the file's own pixels are what vdgs reads."""
+    name, exif = next(iter(scene.cameras)), Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(folder / "images" / name) as image:
+        image.transpose(Image.Transpose.ROTATE_90).save(folder / "images" / name, exif=exif)
+    with pytest.raises(CaptureError, match=rf"{name}: is 48x64, but its camera is 64x48, upright: EXIF.*auto-orient"):
+        load_capture(folder, UP)
+
+
 def test_up_to_ten_images_that_do_not_fit_are_listed(folder, scene):
     for name in scene.cameras:
         cv2.imwrite(str(folder / "images" / name), np.zeros((64, 48, 3), np.uint8))

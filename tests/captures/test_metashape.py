@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from support.captures import write_ply
 from support.metashape_files import (
@@ -417,6 +418,31 @@ def test_names_that_may_be_of_two_photographs_are_none(tmp_path):
     source = read(tmp_path, xml, flight)
     assert any("may be of several photographs" in each and "DJI_0001" in each for each in source.warnings)
     assert not next(view for view in source.views if "DJI_0001" in view.name).image_path.is_file()
+
+
+@pytest.mark.parametrize(
+    ("copied", "remedy"),
+    [
+        (("DCIM", "resized"), "choose the folder of one with --images"),
+        ((".JPG", ".TIF"), "keep only one of each there"),
+    ],
+)
+def test_of_two_photographs_the_one_as_large_as_the_camera_is_taken(tmp_path, copied, remedy):
+    """Shrunk copies of a card, and thermal pictures beside those in colors."""
+    flight = true_flight()
+    flight.touch(tmp_path)
+    for name in flight.names:
+        copy = tmp_path / name.replace(*copied)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (64, 48)).save(copy)
+    with pytest.raises(CaptureError, match=rf"8 of its 8 names .*: DCIM\S* or \S*{copied[1]}.*Of these {remedy}"):
+        read(tmp_path, metashape_xml(flight), flight)
+    Image.new("L", SIZE).save(tmp_path / flight.names[0])
+    for name in flight.names[1:]:
+        (tmp_path / name).write_bytes((tmp_path / flight.names[0]).read_bytes())
+    source = read(tmp_path, metashape_xml(flight), flight)
+    assert {view.name for view in source.views} == {*flight.names}
+    assert any("8 names of the project may be of several" in each for each in source.warnings)
 
 
 # ------------------------------------------------------------------------------------------------ points

@@ -10,10 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from support import project_writers as writers
 from support.known_flight import (
     BentLens,
+    EquidistantLens,
+    FixedAtOneLens,
     KnownFlight,
     MeasuredLens,
     known_flight,
@@ -199,6 +202,22 @@ def test_a_lens_of_visualsfm_that_folds_over_is_named(tmp_path: Path) -> None:
     assert flight.names[0] in said
 
 
+@pytest.mark.parametrize("program", ["bundler", "visualsfm", "visualsfm FixedK"])
+def test_shrunk_photographs_are_told_by_the_pixels_of_a_file_without_sizes(tmp_path: Path, program: str) -> None:
+    """The focal length is that of the photographs that were aligned; photographs of half the size would be misread."""
+    flight = known_flight(MeasuredLens(radial=0.0, k=(0.0, 0.0, 0.0, 0.0)))
+    name, _, fixed = program.partition(" ")
+    file = getattr(writers, f"write_{name}")(tmp_path, flight)
+    if fixed:
+        file.write_text(file.read_text().replace("NVM_V3 \n", "NVM_V3 FixedK 700 400 700 300 0\n", 1))
+    flight.write_photographs(tmp_path / "images")
+    assert len(read(tmp_path, name).views) == len(flight.names)
+    for path in (tmp_path / "images").rglob("*.*"):
+        Image.new("RGB", (400, 300)).save(path)
+    with pytest.raises(CaptureError, match=r"photograph is 400x300: it is of another size\. Give the photographs that"):
+        read(tmp_path, name)
+
+
 @pytest.mark.parametrize("nested", [False, True])
 def test_openmvg_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, nested: bool) -> None:
     file = writers.write_openmvg(tmp_path, flight, nested=nested)
@@ -214,6 +233,23 @@ def test_openmvg_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, nes
 @pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 6), (1, 2, 8)])
 def test_meshroom_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, version: tuple[int, int, int]) -> None:
     writers.write_alicevision(tmp_path, flight, version)
+    flight.write_photographs(tmp_path / "images")
+    check_tie_points(read(tmp_path, "alicevision"), flight)
+
+
+@pytest.mark.parametrize(
+    ("lens", "told"),
+    [
+        (EquidistantLens(k=(0.0,) * 4, sensor=(36.0, 27.0), circle=300.0), {"type": "equidistant"}),
+        (EquidistantLens(k=(0.0,) * 4), {"type": "equidistant", "fisheyeCircleRadius": "280", "sensorHeight": "25"}),
+        (EquidistantLens(), {"type": "equidistant_r3", "fisheyeCircleRadius": "280", "sensorHeight": "25"}),
+        (EquidistantLens(sensor=(36.0, 27.0), circle=300.0), {"type": "equidistant", "distortionType": "radialk3pt"}),
+        (FixedAtOneLens(), {"type": "pinhole", "distortionType": "radialk3pt"}),
+    ],
+)
+def test_lenses_of_meshroom_are_read_to_their_numbers(tmp_path: Path, lens: BentLens, told: dict[str, str]) -> None:
+    flight = known_flight(lens)
+    writers.write_alicevision(tmp_path, flight, **told)
     flight.write_photographs(tmp_path / "images")
     check_tie_points(read(tmp_path, "alicevision"), flight)
 

@@ -79,6 +79,16 @@ def test_names_without_extension_are_photographs_and_no_masks(tmp_path, scene, a
     assert {view.mask_path for view in capture.views} == {None}
 
 
+@pytest.mark.parametrize("scale", [0.01, 0.5, 30.0])
+def test_a_scaled_camera_of_blender_is_the_same_camera(tmp_path, scene, scale):
+    """Its matrix_world has the scale of the camera object in the rotation, and not in the place."""
+    content = write_transforms(tmp_path, scene)
+    for frame in content["frames"][::2]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([scale, scale, scale, 1])).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    assert_sees_the_scene(load_capture(tmp_path), scene)
+
+
 def test_the_focal_length_of_a_frame_comes_before_a_common_one_in_other_words(tmp_path, scene):
     content = write_transforms(tmp_path, scene)
     content["frames"][0]["camera_angle_x"] = 2 * np.arctan(32 / 100)
@@ -275,7 +285,7 @@ def test_single_poses_that_are_none_are_left_out_and_masks_of_instant_ngp_are_tu
     assert kept[:, kept.shape[1] // 3 :].all()
     with pytest.raises(CaptureError, match="finite numbers"):
         load_capture(tmp_path, CaptureOptions(strict=True))
-    content["frames"][0]["transform_matrix"] = (2 * np.eye(4)).tolist()
+    content["frames"][0]["transform_matrix"] = np.diag([2.0, 1, 1, 1]).tolist()
     content["frames"][3]["transform_matrix"] = []
     file.write_text(json.dumps(content))
     with pytest.raises(CaptureError, match="orthonormal"):

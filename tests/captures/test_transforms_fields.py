@@ -37,6 +37,32 @@ def test_angles_stand_in_for_focal_lengths(tmp_path, scene):
     assert_sees_the_scene(load_capture(tmp_path), scene)
 
 
+@pytest.mark.parametrize(("factor", "off"), [(2, 0.0), (2, 0.004), (4, 0.0), (1.5, 0.0), (0.5, 0.0)])
+def test_a_lens_without_a_size_is_of_the_size_that_its_principal_point_says(tmp_path, scene, factor, off):
+    """Of photographs that were shrunk after the file was written, or of a file that was written for shrunk ones."""
+    camera = next(iter(scene.cameras.values()))
+    content = write_transforms(tmp_path, scene)
+    for key in ("w", "h"):
+        content.pop(key)
+    for key in ("fl_x", "fl_y", "cx", "cy"):
+        content[key] *= factor
+    content["cx"] += off * factor * camera.width
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    [seen] = {(view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy) for view in load_capture(tmp_path).views}
+    assert seen == pytest.approx((camera.fx, camera.fy, camera.cx + off * camera.width, camera.cy))
+
+
+@pytest.mark.parametrize("center", [(64.0, 30.0), (83.0, 60.0), (-5.0, 24.0)])
+def test_a_lens_that_may_be_of_any_other_size_is_refused(tmp_path, scene, center):
+    content = write_transforms(tmp_path, scene)
+    content |= {"w": None, "h": None, "cx": center[0], "cy": center[1]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(
+        CaptureError, match=r"principal point at .* photograph is 64x48: it is of another size\. Write w"
+    ):
+        load_capture(tmp_path)
+
+
 @pytest.mark.parametrize("says", [
     {"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True},
 ])  # fmt: skip
@@ -80,7 +106,7 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
     [
         ({"frames": []}, "none"),
         ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
-        ({"frames": [frame(2 * np.eye(4))]}, "orthonormal"),
+        ({"frames": [frame(np.diag([2.0, 1, 1, 1]))]}, r"orthonormal \(scaled or sheared\).*Blender.*Ctrl-A"),
         ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the capture"),
         ({"frames": [frame(np.eye(4), "images/no.png")]}, r"1 of 1 images .* are missing(?s:.)*no\.png"),
         ({"fl_x": "wide"}, "finite number"),

@@ -40,6 +40,27 @@ def write_transforms(root: Path, scene: TinyScene, applied: np.ndarray | None = 
     return content
 
 
+def write_blender(root: Path, train: TinyScene, test: TinyScene) -> TinyScene:
+    """As Blender's scripts: train/ and test/ with photographs of the same names, one angle, no size, no points.
+
+    Returns the views by the names that a capture gives them.
+    """
+    both = {}
+    for side, part in (("train", train), ("test", test)):
+        first = next(iter(part.cameras.values()))
+        frames = [
+            {"file_path": f"./{side}/{name}", "transform_matrix": (
+                np.linalg.inv(camera.camera_from_world) @ OPENGL).tolist()}
+            for name, camera in part.cameras.items()
+        ]  # fmt: skip
+        write_images(root / side, part)
+        content = {"camera_angle_x": 2 * np.arctan(first.width / 2 / first.fx), "frames": frames}
+        (root / f"transforms_{side}.json").write_text(json.dumps(content))
+        both |= {f"{side}/{name}": camera for name, camera in part.cameras.items()}
+    write_ply(root / "points3D.ply", train.points, train.colors)
+    return TinyScene(both, train.points, train.colors)
+
+
 def write_mega_nerf(root: Path, scene: TinyScene, scale: float = 50.0) -> TinyScene:
     """As Mega-NeRF's converter: DRB world, moved and scaled.
 

@@ -57,6 +57,36 @@ class MeasuredLens(BentLens):
         return rays * (bent / np.maximum(length, 1e-12))[:, None] * self.focal + self.center
 
 
+@dataclass(frozen=True)
+class EquidistantLens(BentLens):
+    """AliceVision's, by its source (Equidistant::project, DistortionRadialK3PT): a circle of so many pixels is as far
+    off the axis as half the shorter side of the sensor, in millimetres, is long in focal lengths."""
+
+    k: tuple[float, float, float, float] = (-0.05, 0.02, -0.004, 0.0)
+    p: tuple[float, float] = (0.0, 0.0)
+    sensor: tuple[float, float] = (36.0, 25.0)
+    circle: float = 280.0
+
+    def project(self, local: np.ndarray) -> np.ndarray:
+        focal_mm = self.focal * self.sensor[0] / max(self.size)
+        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+        radius = angle / (0.5 * min(self.sensor) / focal_mm)
+        k1, k2, k3, _ = self.k
+        radius = radius * (1 + k1 * radius**2 + k2 * radius**4 + k3 * radius**6) / (1 + k1 + k2 + k3)
+        around = np.arctan2(local[:, 1], local[:, 0])
+        return self.circle * np.stack([np.cos(around) * radius, np.sin(around) * radius], axis=1) + self.center
+
+
+@dataclass(frozen=True)
+class FixedAtOneLens(BentLens):
+    """AliceVision's pinhole with radialk3pt, which leaves the radius one as it is."""
+
+    p: tuple[float, float] = (0.0, 0.0)
+
+    def project(self, local: np.ndarray) -> np.ndarray:
+        return (super().project(local) - self.center) / (1 + sum(self.k)) + self.center
+
+
 @dataclass(frozen=True, eq=False)
 class KnownFlight:
     """Poses (camera from world [n, 4, 4]) and points [m, 3] in metres east, north, up of `ORIGIN`."""

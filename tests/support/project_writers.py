@@ -201,8 +201,10 @@ def write_openmvg(folder: Path, flight: KnownFlight, *, nested: bool = False) ->
     return file
 
 
-def write_alicevision(folder: Path, flight: KnownFlight, version: tuple[int, int, int] = (1, 2, 6)) -> Path:
-    """cameras.sfm: all numbers as texts, rotations column by column, lenses as the versions have them."""
+def write_alicevision(
+    folder: Path, flight: KnownFlight, version: tuple[int, int, int] = (1, 2, 6), **told_of_lens: str
+) -> Path:
+    """cameras.sfm: all numbers as texts, rotations column by column, lenses as the versions have them, or as said."""
     lens, (width, height) = flight.lens, flight.lens.size
     center, focal = np.array(lens.center), str(36 * lens.focal / width)
     if version >= (1, 2, 1):
@@ -214,7 +216,8 @@ def write_alicevision(folder: Path, flight: KnownFlight, version: tuple[int, int
     intrinsic = {
         "intrinsicId": "7", "width": str(width), "height": str(height), **kind, **told,
         "principalPoint": [str(each) for each in center.tolist()],
-        "distortionParams": [str(each) for each in (*lens.k[:3], *lens.p)],
+        "distortionParams": [str(each) for each in (*lens.k[:3], *(lens.p if any(lens.p) else ()))],
+        **told_of_lens,
     }  # fmt: skip
     poses = [
         {"poseId": str(k), "pose": {"transform": {"rotation": [str(each) for each in pose[:3, :3].T.ravel().tolist()],

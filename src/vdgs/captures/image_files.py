@@ -44,7 +44,7 @@ OTHER_SUFFIXES = {".jxl", ".jp2", ".j2k", ".gif", ".psd", ".exr", ".hdr", ".tga"
 #: Photographs of which only some installations read all, or none do.
 OTHER_IMAGE_SUFFIXES = HEIF_SUFFIXES | AVIF_SUFFIXES | RAW_SUFFIXES | JPEG_SUFFIXES | OTHER_SUFFIXES
 #: Maker and model of a camera in EXIF.
-_CAMERA_TAGS = {0x010F, 0x0110}
+_CAMERA_TAGS, _ORIENTATION = {0x010F, 0x0110}, 0x0112
 #: Headers that announce more pixels than this are refused rather than decoded.
 MAX_IMAGE_PX = 1_000_000_000
 #: A photograph or mask with a shorter side than this (pixels) shows nothing: a thumbnail, what is left of a file, or
@@ -148,6 +148,15 @@ def has_camera(path: Path) -> bool:
     try:
         with pillow_without_limits(), Image.open(path) as image:
             return not _CAMERA_TAGS.isdisjoint(image.getexif())
+    except Exception:  # Pillow's parsers raise many kinds on damaged headers
+        return False
+
+
+def is_turned(path: Path) -> bool:
+    """Whether EXIF says that an image is to be shown turned by a quarter, which the pixels of its file are not."""
+    try:
+        with open_image(path) as image:
+            return image.getexif().get(_ORIENTATION) in (5, 6, 7, 8)
     except Exception:  # Pillow's parsers raise many kinds on damaged headers
         return False
 

@@ -17,7 +17,7 @@ from vdgs.captures.formats.source_capture import (
     format_list,
     refuse_many_missing,
 )
-from vdgs.captures.image_files import find_images, read_header, readable_suffixes, same_aspect
+from vdgs.captures.image_files import find_images, is_turned, read_header, readable_suffixes, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
 from vdgs.captures.name_resolution import ImageNameIndex, NameLookup
 from vdgs.captures.strays import masked_stem
@@ -138,10 +138,15 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
     if not same_aspect((header.width, header.height), (intrinsics.width, intrinsics.height)):
         turned = same_aspect((header.height, header.width), (intrinsics.width, intrinsics.height))
         hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
+        sizes = f"is {header.width}x{header.height}, but its camera is {intrinsics.width}x{intrinsics.height}"
+        if turned and is_turned(path):
+            raise CaptureError(
+                f"{path}: {sizes}, upright: EXIF turns the photograph by a quarter, and vdgs takes its pixels as the "
+                "file has them. Give copies that are written upright (magick mogrify -auto-orient)."
+            )
         raise CaptureError(
-            f"{path}: is {header.width}x{header.height}, but its camera is "
-            f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
-            f"{hint}Use the images that the model was made from, or shrink them evenly."
+            f"{path}: {sizes}: another shape, so the two do not belong together. {hint}Use the images that the model "
+            "was made from, or shrink them evenly."
         )
     return scale_intrinsics(intrinsics, header.width, header.height)
 

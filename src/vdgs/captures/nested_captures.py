@@ -68,6 +68,10 @@ _BY_CONTENT = (
         ".json", b'"initpose"',
         "poses of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of them, which is read",
     ),
+    (
+        ".json", b'"transform_matrix"',
+        "a file of poses like transforms.json, by another name; rename it to transforms.json, which is read",
+    ),
     (".json", b'"img_name"', "cameras of a trained 3DGS scene; the capture that it was trained on is read"),
     (".json", b'"sfm_data_version"', "photographs of OpenMVG without poses; the sfm_data.json after its SfM is read"),
     (".sfm", b'"viewid"', "photographs of Meshroom without poses; cameras.sfm of its step StructureFromMotion is read"),
@@ -81,6 +85,9 @@ _BY_CONTENT = (
     ),
 )  # fmt: skip
 _HEAD_BYTES = 4096
+#: Files beside transforms_train.json, and those of a COLMAP model.
+_SET_FILES = {"transforms_train.json", "transforms_test.json", "transforms_val.json"}
+_MODEL_STEMS = {"cameras", "images", "points3d", "rigs", "frames"}
 #: A file of poses with fewer bytes has none ("[]").
 _LEAST_BYTES = 20
 
@@ -126,12 +133,28 @@ def foreign_poses(root: Path) -> list[str]:
 
 
 def check_no_foreign_file(path: Path) -> None:
-    """Raise CaptureError for a file of another program that is not read, with what is read instead."""
+    """Raise CaptureError for a file of another program that is not read, with what is read instead, and for one that is
+    a part of a capture, with the folder of this."""
     if not path.is_file():
         return
+    whole = _capture_of(path)
+    if whole is not None:
+        raise CaptureError(f"{path}: is a part of a capture. Give the folder of it all: {shell_word(whole)}")
     what = next((what for name, what in _OTHERS.items() if fnmatch(path.name.lower(), name)), "") or _by_content(path)
     if what:
         raise CaptureError(f"{path}: is {what}.")
+
+
+def _capture_of(file: Path) -> Path | None:
+    """The folder of a capture that a file of poses or points is a part of: of a set's transforms_train.json, or of a
+    COLMAP model; None for other files."""
+    folder = file.absolute().parent
+    if file.name in _SET_FILES and pose_files(folder):
+        return file.parent
+    if file.stem.lower() not in _MODEL_STEMS or folder not in find_models(folder):
+        return None
+    roots = [root for root in folder.parents[:3] if folder in find_models(root) and _has_photographs(root)]
+    return roots[0] if roots else file.parent
 
 
 def _by_content(file: Path) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.photograph_sizes import name_unaligned, photograph_sizes
+from vdgs.captures.formats.photograph_sizes import check_seen_inside, name_unaligned, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
@@ -97,6 +97,7 @@ def read(file: Path, options: CaptureOptions) -> Project:
         first, last = np.searchsorted(model.seen_camera[order], [camera.number, camera.number + 1])
         mine = order[first:last]
         shown = model.seen_point[mine], model.seen_px[mine] + np.array(size) / 2
+        check_seen_inside(shown[1], size, file, name)
         lens, pose = camera.intrinsics(size, file), camera.camera_from_world
         views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=shown))
     return Project(

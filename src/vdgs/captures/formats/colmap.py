@@ -16,7 +16,7 @@ import numpy as np
 
 from vdgs.captures.capture import Observations
 from vdgs.captures.formats.colmap_binary import read_cameras_binary, read_images_binary, read_points3D_binary
-from vdgs.captures.formats.colmap_records import ColmapImage, ColmapPoints, empty_points
+from vdgs.captures.formats.colmap_records import Cameras, ColmapImage, ColmapPoints, empty_points
 from vdgs.captures.formats.colmap_text import read_cameras_text, read_images_text, read_points3D_text
 from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.source_capture import (
@@ -132,9 +132,10 @@ def _format(folder: Path) -> str | None:
 
 
 def _views(
-    records: list[ColmapImage], cameras: dict[int, Intrinsics], points: ColmapPoints, file: Path, strict: bool
+    records: list[ColmapImage], cameras: Cameras, points: ColmapPoints, file: Path, strict: bool
 ) -> tuple[tuple[SourceView, ...], tuple[str, ...]]:
-    """Posed views in name order, and notes; raises on many silly poses or names given twice, and on unknown cameras."""
+    """Posed views in name order, and notes; raises on many silly poses or names given twice, on unknown cameras, and
+    on those in use that cannot be used."""
     orphans = [f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras]
     if orphans:
         raise CaptureError(
@@ -145,6 +146,8 @@ def _views(
     views, bad = list[SourceView](), dict[str, CaptureError]()
     for record in records:
         intrinsics = cameras[record.camera]
+        if isinstance(intrinsics, CaptureError):
+            raise intrinsics
         sightings = _sightings(record, sorted_points, intrinsics)
         name = safe_name(_below_a_folder(record.name), file)
         try:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.colmap_records import (
+    Cameras,
     ColmapImage,
     ColmapPoints,
     add_camera,
@@ -23,7 +24,7 @@ from vdgs.captures.formats.source_capture import CAMERA_MODELS, Intrinsics
 from vdgs.errors import CaptureError
 
 MAX_NAME_BYTES = 4096
-#: COLMAP's number of a model that is no lens.
+#: COLMAP's number of a model that is no lens, whose parameters are the width and the height.
 _EQUIRECTANGULAR = 17
 
 
@@ -79,14 +80,18 @@ class _Cursor:
             raise self.fail(f"{self.left} bytes are left over after the last record")
 
 
-def read_cameras_binary(file: Path) -> dict[int, Intrinsics]:
+def read_cameras_binary(file: Path) -> Cameras:
     cursor = _Cursor(file)
-    cameras: dict[int, Intrinsics] = {}
+    cameras: Cameras = {}
     for _ in range(cursor.count(24 + 2 * 8, "cameras")):
         identifier, model, width, height = cursor.take("IiQQ")
-        if model not in CAMERA_MODELS:
-            named = f"number {model}{' (EQUIRECTANGULAR)' if model == _EQUIRECTANGULAR else ''}"
-            raise unsupported_model(file, f"camera {identifier}", named)
+        if model == _EQUIRECTANGULAR:
+            cursor.take("2d")
+            named = f"number {model} (EQUIRECTANGULAR)"
+            add_camera(cameras, identifier, unsupported_model(file, f"camera {identifier}", named), file)
+            continue
+        if model not in CAMERA_MODELS:  # nobody knows how long it is, so that those after it cannot be read
+            raise unsupported_model(file, f"camera {identifier}", f"number {model}")
         name, parameters = CAMERA_MODELS[model]
         intrinsics = Intrinsics(name, cursor.take(f"{parameters}d"), width, height)
         add_camera(cameras, identifier, intrinsics, file)

@@ -16,6 +16,10 @@ from vdgs.errors import CaptureError
 MAX_OBSERVATIONS = 400
 
 
+#: Cameras by number; of those that cannot be used the error, which concerns who uses one: models hold unused ones.
+Cameras = dict[int, Intrinsics | CaptureError]
+
+
 class ColmapPoints(NamedTuple):
     """Points [n, 3] float64 and colors [n, 3] uint8 with the numbers [n] by which images name them."""
 
@@ -63,7 +67,13 @@ def unsupported_model(file: Path, where: str, model: str) -> CaptureError:
     )
 
 
-def add_camera(cameras: dict[int, Intrinsics], identifier: int, intrinsics: Intrinsics, file: Path) -> None:
+def add_camera(cameras: Cameras, identifier: int, camera: Intrinsics | CaptureError, file: Path) -> None:
+    """Add a camera, or why it cannot be used. Raises `CaptureError` for a second one of a number."""
     if identifier in cameras:
         raise CaptureError(f"{file}: camera {identifier} occurs twice. Export the COLMAP model again.")
-    cameras[identifier] = check_intrinsics(intrinsics, file, f"camera {identifier}")
+    if isinstance(camera, Intrinsics):
+        try:
+            check_intrinsics(camera, file, f"camera {identifier}")
+        except CaptureError as error:
+            camera = error
+    cameras[identifier] = camera

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.colmap_records import (
+    Cameras,
     ColmapImage,
     ColmapPoints,
     add_camera,
@@ -51,9 +52,9 @@ def _number(word: str) -> float:
     return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
 
 
-def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
+def read_cameras_text(file: Path) -> Cameras:
     expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-    cameras: dict[int, Intrinsics] = {}
+    cameras: Cameras = {}
     for number, line in _lines(file):
         words = line.split()
         if not words:
@@ -63,9 +64,10 @@ def read_cameras_text(file: Path) -> dict[int, Intrinsics]:
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             raise _bad_line(file, number, expected) from None
+        camera: Intrinsics | CaptureError = Intrinsics(model, params, width, height)
         if MODEL_PARAMETERS.get(model) != len(params):
-            raise unsupported_model(file, f"line {number}", f"{model!r} with {len(params)} parameters")
-        add_camera(cameras, identifier, Intrinsics(model, params, width, height), file)
+            camera = unsupported_model(file, f"line {number}", f"{model!r} with {len(params)} parameters")
+        add_camera(cameras, identifier, camera, file)
     return cameras
 
 

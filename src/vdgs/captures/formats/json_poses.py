@@ -9,14 +9,28 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import BROWN, BadPose, Intrinsics, check_intrinsics
-from vdgs.captures.image_files import read_header
+from vdgs.captures.formats.source_capture import (
+    BROWN,
+    CENTERED,
+    BadPose,
+    Intrinsics,
+    check_centered,
+    check_intrinsics,
+    to_rigid,
+)
+from vdgs.captures.image_files import read_header, same_aspect
 from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
 #: Camera axes: OpenGL (right, up, back) from OpenCV (right, down, forward); its own inverse.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+#: A rotation that is longer or shorter by more than this share is scaled; rounding makes less.
+_SCALED = 1e-3
+_UNSCALE = (
+    "The file is damaged or of another convention; if Blender wrote it, apply the scale of the camera and of what it "
+    "hangs on (Ctrl-A, Scale), and export again."
+)
 
 
 def read_capture_json(file: Path) -> JsonObject:
@@ -54,6 +68,18 @@ def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:
     result = np.eye(4)
     result[:3] = matrix[:3]
     return result
+
+
+def camera_motion(matrix: np.ndarray, file: Path, label: str) -> np.ndarray:
+    """World from camera [4, 4], a rigid motion with OpenCV's axes of the camera, of one with OpenGL's.
+
+    A scale of the rotation is divided out: Blender writes it where the camera object is scaled, and sees the same with
+    it. The place of the camera has no part in it. Raises `BadPose` where more than a scale is left.
+    """
+    matrix, scale = matrix.copy(), float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+    if scale > 0 and abs(scale - 1) > _SCALED:
+        matrix[:3, :3] /= scale
+    return to_rigid(matrix @ OPENGL_FROM_OPENCV, file, label, remedy=_UNSCALE)
 
 
 def axis_rotation(axis: int, degrees: float) -> np.ndarray:
@@ -100,7 +126,8 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     """Intrinsics of a frame, its own keys before the common ones (fl_x, fl_y, cx, cy, w, h, k1...p2).
 
     Focal lengths may be given as camera_angle_x, y (radians). Where w and h are absent the image's own
-    size is taken. Raises `CaptureError` for missing focal lengths and for lenses that are not understood.
+    size is taken, or the multiple of it that cx and cy are the middle of: the file may be of the photographs before
+    they were shrunk. Raises `CaptureError` for missing focal lengths and for lenses that are not understood.
     """
     own = {key: value for key, value in frame.items() if value is not None}
     replaced = _FOCAL if not _FOCAL.isdisjoint(own) else frozenset()  # a frame's angle says more than a common fl_x
@@ -113,7 +140,7 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     width, height = get("w"), get("h")
     if width is None or height is None:
         header = read_header(image)
-        width, height = header.width, header.height
+        width, height = _told_size((header.width, header.height), (get("cx"), get("cy")), file, image.name)
     fx = get("fl_x", _focal(width, get("camera_angle_x")))
     fy = get("fl_y", fx if get("fl_x") is not None else _focal(height, get("camera_angle_y")))
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
@@ -131,6 +158,27 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
 
 
+def _told_size(
+    size: tuple[int, int], center: tuple[float | None, float | None], file: Path, label: str
+) -> tuple[int, int]:
+    """The size that a lens without one is told for, by the photograph's and the principal point. Raises `CaptureError`
+    where that is in the middle of no size that has the shape of the photograph."""
+    cx, cy = center
+    if not cx or not cy or all(CENTERED[0] < c / side < CENTERED[1] for c, side in zip((cx, cy), size, strict=True)):
+        return size
+    across, down = 2 * cx / size[0], 2 * cy / size[1]
+    if cx > 0 and cy > 0:
+        for many in _SHRUNK:
+            if max(abs(across / many - 1), abs(down / many - 1)) < _MIDDLE:
+                return round(size[0] * many), round(size[1] * many)
+        if same_aspect((round(2 * cx), round(2 * cy)), size):
+            return round(2 * cx), round(2 * cy)
+    check_centered((cx, cy), size, file, label, "Write w and h into the file, or give the photographs of that size.")
+    return size
+
+
+#: By whole numbers photographs are shrunk, or the file is; principal points are so near the middle, as a share of it.
+_SHRUNK, _MIDDLE = (*range(2, 17), *(1 / many for many in range(2, 17))), 0.01
 #: Ways to say a focal length, one of which is enough.
 _FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")

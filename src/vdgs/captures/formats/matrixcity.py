@@ -15,8 +15,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from vdgs.captures.capture import Split
+from vdgs.captures.formats.frame_photographs import FramePhotographs
 from vdgs.captures.formats.json_poses import (
-    OPENGL_FROM_OPENCV,
+    camera_motion,
     get_frames,
     parse_intrinsics,
     parse_matrix,
@@ -30,7 +31,6 @@ from vdgs.captures.formats.source_capture import (
     leave_out_bad_poses,
     one_view_each,
     refuse_many_missing,
-    to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.config.capture_options import CaptureOptions
@@ -42,8 +42,6 @@ from vdgs.system.units import first_names
 POSE_UNIT_M = 100.0
 #: The rotation in per-block files is this times a rotation.
 BLOCK_ROTATION = 0.01
-#: Where a block keeps its images.
-IMAGE_FOLDERS = ("", "rgb", "input", "images")
 #: What the folders of its blocks are called in the paths of its images.
 CITY_PATTERN = re.compile(
     r"block_?(all|fusion|\d+|[a-z])(_test|_train)?|(small|big)_city.*|matrix_?city.*", re.IGNORECASE
@@ -75,11 +73,14 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     missing: list[str] = []
     bad: dict[str, CaptureError] = {}
     count, is_city = 0, False
+    photographs = FramePhotographs(root, options.images)
     for file, split in files:
         content = read_capture_json(file)
+        if split == "test" and content.get("frames") == []:
+            continue  # as programs write that hold no photograph out: no test file
         for frame in get_frames(content, file):
             count, is_city = count + 1, is_city or _of_a_city(frame)
-            image = _find_image(root, frame, file, split)
+            image = photographs.find(frame, file, split)
             if isinstance(image, str):
                 missing.append(image)
                 continue
@@ -90,11 +91,11 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
                 continue
             views.append(view)
             scales.add(scale)
-    warnings = _missing(missing, count, root, options.strict)
+    warnings = _missing(missing, count, root / (options.images or ""), options.strict, is_city)
     views, both = _without_tested(views)
     views, warnings = one_view_each(views, root, bad), warnings + both
     warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
-    if len(scales) > 1:
+    if is_city and len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
     what = "MatrixCity's layout" if is_city else files[0][0].name
@@ -144,10 +145,12 @@ def _without_tested(views: list[SourceView]) -> tuple[list[SourceView], tuple[st
     return kept, (f"{first_names(both)}: {said}.",)
 
 
-def _missing(missing: list[str], count: int, root: Path, strict: bool) -> tuple[str, ...]:
+def _missing(missing: list[str], count: int, folder: Path, strict: bool, is_city: bool) -> tuple[str, ...]:
     try:
-        return tuple(refuse_many_missing(missing, count, root, strict))
+        return tuple(refuse_many_missing(missing, count, folder, strict))
     except CaptureError as error:
+        if not is_city:
+            raise
         raise CaptureError(f"{error}\n(Unpack the .tar of each block into the block's folder.)") from None
 
 
@@ -162,47 +165,9 @@ def _read_frame(
     if scaled:
         matrix[:3, :3] /= BLOCK_ROTATION
     name, image = found
-    pose = np.linalg.inv(to_rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
+    pose = np.linalg.inv(camera_motion(matrix, file, f"frame {label}"))
     common = {key: value for key, value in content.items() if key != "frames"}
     intrinsics = parse_intrinsics(frame, common, image, file)
     return SourceView(
         name=name, camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image
     ), 1.0 if scaled else POSE_UNIT_M
-
-
-def _find_image(root: Path, frame: JsonObject, file: Path, split: Split) -> tuple[str, Path] | str:
-    """Name (as from the dataset's root) and file of a frame's image; what it is called where it is gone.
-
-    Published file_paths climb ("../../train/block_1/0000.png"); the climbing is dropped and the rest is
-    looked for beside the pose file, in the capture, and up to three folders above a pose/ folder.
-    """
-    path = frame.get("file_path")
-    if isinstance(path, str):
-        parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("..", ".", "/")]
-    elif isinstance(frame.get("frame_index"), int):
-        folder = [part for part in PurePosixPath(str(frame.get("path", ""))).parts if part not in ("..", ".", "/")]
-        parts = [*folder, f"{frame['frame_index']:04d}.png"]
-    else:
-        raise CaptureError(f"{file}: a frame has neither 'file_path' nor 'frame_index'. Export the file again.")
-    if not parts or any("\0" in part for part in parts):
-        raise CaptureError(f"{file}: a frame names no image ({path!r}). Export the file again.")
-    bases = [file.parent, root]
-    if root.parent.name == "pose":
-        bases += [root.parent.parent, root.parent.parent.parent]
-    tails = [parts, [split, *parts[-2:]], parts[-1:]]
-    for tail in tails:
-        for base in bases:
-            for sub in IMAGE_FOLDERS:
-                candidate = base.joinpath(*tail[:-1], sub, tail[-1])
-                for image in (candidate, candidate.with_name(candidate.name + ".png")):
-                    if image.is_file():
-                        return _name(root, image, split), image
-    return "/".join(parts)
-
-
-def _name(root: Path, image: Path, split: Split) -> str:
-    """A name that is unique across blocks: the path below the capture, or split/block/file."""
-    if image.is_relative_to(root):
-        return image.relative_to(root).as_posix()
-    parts = [part for part in image.parts[-3:] if part not in IMAGE_FOLDERS]
-    return "/".join([split, *parts[-2:]])

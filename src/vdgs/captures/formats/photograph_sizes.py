@@ -7,11 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from vdgs.captures.formats.project_photographs import find_photographs
 from vdgs.captures.formats.source_capture import LEAST_THERE, MAX_MISSING_LISTED, format_list
-from vdgs.captures.image_files import read_header
+from vdgs.captures.image_files import ROUNDING_PX, read_header
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+
+#: Programs that align a photograph see few points beside it: at most this share (choice).
+MAX_OUTSIDE = 0.1
+GIVE_ALIGNED = "Give the photographs that were aligned (--images)."
 
 
 def photograph_sizes(root: Path, options: CaptureOptions, names: Sequence[str], file: Path) -> list[tuple[int, int]]:
@@ -27,6 +33,19 @@ def photograph_sizes(root: Path, options: CaptureOptions, names: Sequence[str], 
     sizes = [(header.width, header.height) if header else None for header in headers]
     usual = Counter(size for size in sizes if size).most_common(1)[0][0]
     return [size or usual for size in sizes]
+
+
+def check_seen_inside(pixels: np.ndarray, size: tuple[int, int], file: Path, name: str) -> None:
+    """Raise `CaptureError` where a photograph is said to show points beside itself, at `pixels` [n, 2] from its corner:
+    it is smaller than the one that was aligned, whose focal length and pixels the file has."""
+    if not len(pixels):
+        return
+    outside = (pixels < -ROUNDING_PX).any(axis=1) | (pixels > np.array(size) + ROUNDING_PX).any(axis=1)
+    if outside.mean() > MAX_OUTSIDE:
+        raise CaptureError(
+            f"{file}: {outside.mean():.0%} of the points that {name} shows lie beside it, for the photograph is "
+            f"{size[0]}x{size[1]}: it is of another size. {GIVE_ALIGNED}"
+        )
 
 
 def leave_out(

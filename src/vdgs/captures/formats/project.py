@@ -96,7 +96,8 @@ def project_capture(
     _check_sightings(project)
     lost += _without_system(project, options.strict)
     names = [view.names for view in project.views]
-    found = find_photographs(root, options, names, project.file)
+    sizes = [(view.intrinsics.width, view.intrinsics.height) for view in project.views]
+    found = find_photographs(root, options, names, project.file, sizes)
     world = _world_of(project)
     poses = world.moved_poses([view.camera_from_world for view in project.views])
     points, colors, warnings = world.moved(project.points), project.colors, [*project.warnings, *lost, *found.warnings]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, readable_images
+from vdgs.captures.formats.source_capture import LEAST_THERE
+from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, read_header, readable_images
 from vdgs.captures.name_resolution import to_nfc, without_uri
 from vdgs.captures.strays import is_mask_folder, walk
 from vdgs.config.capture_options import CaptureOptions
@@ -31,17 +33,25 @@ class FoundPhotographs:
 
 
 def find_photographs(
-    root: Path, options: CaptureOptions, names: Sequence[tuple[str, ...]], file: Path
-) -> FoundPhotographs:
+    root: Path, options: CaptureOptions, names: Sequence[tuple[str, ...]], file: Path,
+    sizes: Sequence[tuple[int, int]] | None = None,
+) -> FoundPhotographs:  # fmt: skip
     """The photographs of cameras, each known by some `names`, below the folder that `options` name, else images/, else
-    the whole capture.
+    the whole capture. Of several that a name may mean the one is taken that alone has the camera's width and height,
+    where `sizes` says these.
 
-    Raises `CaptureError` where none is there, and for photographs that are several cameras'.
+    Raises `CaptureError` where none is there, where too many may be any of several, and for photographs that are
+    several cameras'.
     """
     folder = image_root(root, options)
     images = _find_images(folder, options)
     index = PhotographIndex(images)
-    found = [next(filter(None, map(index.find, each)), None) for each in names]
+    meant = [index.find_all(each) for each in names]
+    found = [each[0] if len(each) == 1 else None for each in meant]
+    if sizes is not None:
+        found = [name or _of_size(each, size, images) for name, each, size in zip(found, meant, sizes, strict=True)]
+    unclear = [each for name, each in zip(found, meant, strict=True) if name is None and len(each) > 1]
+    _refuse_many_unclear(unclear, len(names) - found.count(None), len(names), file)
     relative = folder.relative_to(root).as_posix() if folder.is_relative_to(root) else folder.as_posix()
     if not any(found):
         wanted = ", ".join(each[0] for each in names[:3]) + (", ..." if len(names) > 3 else "")
@@ -56,12 +66,43 @@ def find_photographs(
             f"{file}: several of its cameras mean the same photograph: {', '.join(twice[:10])}. Photographs of one "
             "name need their folders, on disk and in the project: give the folder above them with --images."
         )
-    unclear = [each[0] for each, name in zip(names, found, strict=True) if name is None and index.is_ambiguous(each)]
     notes = [f"{len(unclear)} names of the project may be of several photographs in {folder}, and are taken for none "
-             f"({', '.join(unclear[:10])})."] if unclear else []  # fmt: skip
+             f"({_either(unclear[:10])})."] if unclear else []  # fmt: skip
+    chosen = [name for name, each in zip(found, meant, strict=True) if name is not None and len(each) > 1]
+    if chosen:
+        notes.append(
+            f"{len(chosen)} names of the project may be of several photographs in {folder}; those are taken that are "
+            f"as large as the cameras ({', '.join(chosen[:10])})."
+        )
     called = [name or _plain(each[0]) for name, each in zip(found, names, strict=True)]
     paths = tuple(images.get(name, folder / name) for name in called)
     return FoundPhotographs(relative, tuple(called), paths, tuple(notes))
+
+
+def _of_size(names: Sequence[str], size: tuple[int, int], images: dict[str, Path]) -> str | None:
+    """The only photograph of a width and height, if one alone has these."""
+    fitting = []
+    for name in names:
+        with suppress(CaptureError):
+            header = read_header(images[name])
+            fitting += [name] if (header.width, header.height) == size else []
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def _refuse_many_unclear(unclear: Sequence[Sequence[str]], found: int, count: int, file: Path) -> None:
+    """Raise `CaptureError` where photographs would be enough if it were known which of several they are."""
+    if not unclear or not found < LEAST_THERE * count <= found + len(unclear):
+        return
+    apart = all(len({PurePosixPath(name).parent for name in each}) > 1 for each in unclear)
+    remedy = "choose the folder of one with --images" if apart else "keep only one of each there"
+    raise CaptureError(
+        f"{file}: {len(unclear)} of its {count} names may be of several photographs each: "
+        f"{_either(unclear[:3])}{', ...' if len(unclear) > 3 else ''}. Of these {remedy}."
+    )
+
+
+def _either(unclear: Sequence[Sequence[str]]) -> str:
+    return ", ".join(" or ".join(each[:3]) for each in unclear)
 
 
 def image_root(root: Path, options: CaptureOptions) -> Path:
@@ -101,13 +142,11 @@ class PhotographIndex:
             for key in dict.fromkeys((last, _stem(last))):
                 self._by_name.setdefault(key, []).append(name)
 
-    def find(self, name: str) -> str | None:
-        """The name on disk; None where there is none, or several are as likely."""
-        best = self._best(name)
-        return best[0] if len(best) == 1 else None
-
-    def is_ambiguous(self, names: Sequence[str]) -> bool:
-        return any(len(self._best(name)) > 1 for name in names)
+    def find_all(self, names: Sequence[str]) -> list[str]:
+        """The names on disk of a photograph that is called by all these: one where some name is of one alone, several
+        where they are as likely, none where there is none."""
+        found = [self._best(name) for name in names]
+        return min(filter(None, found), key=lambda each: len(each) > 1, default=[])
 
     def _best(self, name: str) -> list[str]:
         parts = _parts(name)

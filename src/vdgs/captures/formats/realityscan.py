@@ -23,9 +23,9 @@ import numpy as np
 from vdgs.captures.coordinate_systems import ToGeodetic, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, axis_rotation
-from vdgs.captures.formats.photograph_sizes import name_unaligned, photograph_sizes
+from vdgs.captures.formats.photograph_sizes import GIVE_ALIGNED, name_unaligned, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
-from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.source_capture import Intrinsics, check_centered, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
@@ -78,11 +78,7 @@ class RegisteredCamera:
         focal, center = self.focal_35mm * longer / 36, (px * longer + width / 2, py * longer + height / 2)
         if self.in_pixels:
             focal, center = self.focal_35mm, (px, py)
-            if not (0.3 < px / width < 0.7 and 0.3 < py / height < 0.7):
-                raise CaptureError(
-                    f"{file}: {self.name} has its principal point at {px:.0f}, {py:.0f} pixels, and the photograph is "
-                    f"{width}x{height}: it is of another size. Give the photographs that were aligned (--images)."
-                )
+            check_centered(center, size, file, self.name, GIVE_ALIGNED)
         lens = brown_intrinsics(
             (focal, focal * self.lens.get("aspect", 1.0)), center, size,
             radial=(k1, k2, k3, k4), tangential=(t2, t1), skew=self.lens.get("skew", 0.0) * longer,

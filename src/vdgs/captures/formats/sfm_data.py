@@ -30,7 +30,8 @@ _AGAIN = "Export it again."
 #: AliceVision's kinds of lenses, as its versions call them, by the terms of `_lens`.
 _ALICEVISION = {
     "pinhole": "", "none": "", "radial1": "radial", "radialk1": "radial", "radial3": "radial", "radialk3": "radial",
-    "brown": "brown", "fisheye4": "fisheye", "fisheye": "fisheye",
+    "brown": "brown", "fisheye4": "fisheye", "fisheye": "fisheye", "radialk3pt": "radial at one",
+    "equidistant": "equidistant", "equidistant_r3": "equidistant", "equidistant radialk3pt": "equidistant",
 }  # fmt: skip
 #: OpenMVG's, by the name of their parameters.
 _PARAMETERS = {"disto_k1": "radial", "disto_k3": "radial", "disto_t2": "brown", "fisheye": "fisheye"}
@@ -170,10 +171,16 @@ def _openmvg_lens(entry: JsonObject, file: Path) -> Intrinsics | str:
     return _lens(_PARAMETERS.get(kind, ""), (focal, focal), center, values, values.get(kind), (file, label))
 
 
+def _alicevision_kind(entry: JsonObject) -> str:
+    """A lens of AliceVision in one word or two; since version 1.2.7 the distortion has a word of its own."""
+    kind, bend = str(entry.get("type", "")).lower(), str(entry.get("distortionType") or "none").lower()
+    if bend == "none" or kind not in ("pinhole", "equidistant"):
+        return kind
+    return bend if kind == "pinhole" else f"{kind} {bend}"
+
+
 def _alicevision_lens(entry: JsonObject, version: tuple[int, ...], file: Path) -> Intrinsics | str:
-    label, kind = f"lens {entry['intrinsicId']}", str(entry.get("type", "")).lower()
-    if kind == "pinhole" and entry.get("distortionType"):
-        kind = str(entry["distortionType"]).lower()
+    label, kind = f"lens {entry['intrinsicId']}", _alicevision_kind(entry)
     if kind not in _ALICEVISION:
         return f"{label} is {kind!r}; read are {', '.join(_ALICEVISION)}"
 
@@ -192,7 +199,43 @@ def _alicevision_lens(entry: JsonObject, version: tuple[int, ...], file: Path) -
     else:
         across, ratio = number("focalLength") / (number("sensorWidth") or 36.0) * width, number("pixelRatio", 1.0)
         focal = (across, across / ratio if version < (1, 2, 5) else across * ratio)
-    return _lens(_ALICEVISION[kind], focal, center.tolist(), entry, entry.get("distortionParams"), (file, label))
+    bends = entry.get("distortionParams")
+    if _ALICEVISION[kind] in ("equidistant", "radial at one"):
+        unit = 1.0
+        if _ALICEVISION[kind] == "equidistant":
+            focal, unit = _equidistant_scale(focal[0], (width, height), entry, file)
+        focal, bends = _fixed_at_one(focal, unit, bends, (file, label))
+    lens = "fisheye" if _ALICEVISION[kind] == "equidistant" else _ALICEVISION[kind]
+    return _lens(lens, focal, center.tolist(), entry, bends, (file, label))
+
+
+def _equidistant_scale(
+    focal: float, size: tuple[float, float], entry: JsonObject, file: Path
+) -> tuple[tuple[float, float], float]:
+    """The pixels of a radian in AliceVision's equidistant lens, and how many of its units, in which it bends, a radian
+    is: one is the angle that half the shorter side of the sensor spans, and as long as the radius of the circle."""
+    longer, shorter = max(size), min(size)
+    if not shorter > 0:
+        return (focal, focal), 1.0
+    across = parse_number(entry, "sensorWidth", file) or 36.0
+    down = parse_number(entry, "sensorHeight", file) or across * shorter / longer
+    radius = parse_number(entry, "fisheyeCircleRadius", file) or shorter / 2
+    unit = 2 * focal * across / longer / min(across, down)
+    return (radius * unit, radius * unit), unit
+
+
+def _fixed_at_one(
+    focal: tuple[float, float], unit: float, bends: object, told: tuple[Path, str]
+) -> tuple[tuple[float, float], list[float]]:
+    """The focal lengths and the radial terms of a lens whose terms, of a radius in `unit`s, leave the radius one as it
+    is: (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k1 + k2 + k3). Raises `CaptureError` where they do so for no radius."""
+    file, label = told
+    bends = bends if isinstance(bends, list) else []
+    terms = parse_vector(bends, len(bends), file, f"{label}: its distortion")
+    whole = 1.0 + float(terms.sum())
+    if not whole > 0:
+        raise CaptureError(f"{file}: {label} has a distortion that turns the picture round. {_AGAIN}")
+    return (focal[0] / whole, focal[1] / whole), [k * unit ** (2 * n) for n, k in enumerate(terms.tolist(), 1)]
 
 
 def _lens(

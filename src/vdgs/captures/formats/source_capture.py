@@ -43,6 +43,8 @@ PINHOLE_WHEN_ZERO = {
 #: The lenses of `brown_lens`, which are none of COLMAP's.
 BROWN, GENERAL, GENERAL_FISHEYE, EQUISOLID = OWN_LENSES = ("BROWN", "GENERAL", "GENERAL_FISHEYE", "EQUISOLID")
 MAX_SIDE_PX = 100_000
+#: The principal point of a photograph as it was taken lies between these shares of its sides (choice).
+CENTERED = (0.3, 0.7)
 #: Names that messages list, and those of photographs that are gone, which a person must find.
 MAX_LISTED, MAX_MISSING_LISTED = 10, 100
 #: A capture is used without the photographs that are gone where at least this share is there (choice).
@@ -251,7 +253,22 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     return intrinsics
 
 
-def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:
+def check_centered(center: tuple[float, float], size: tuple[int, int], file: Path, label: str, remedy: str) -> None:
+    """Raise `CaptureError` for a principal point, in pixels from the corner, that is far from the middle of a
+    photograph whose size the file does not say: the lens is told for another size, its focal length too."""
+    (x, y), (width, height) = center, size
+    low, high = CENTERED
+    if not (low < x / width < high and low < y / height < high):
+        raise CaptureError(
+            f"{file}: {label} has its principal point at {x:.0f}, {y:.0f} pixels, and the photograph is "
+            f"{width}x{height}: it is of another size. {remedy}"
+        )
+
+
+def to_rigid(
+    matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3, *,
+    remedy: str = "The file is damaged or of another convention.",
+) -> np.ndarray:  # fmt: skip
     """A rigid motion [4, 4] float64 from one that is rigid up to rounding.
 
     The rotation is replaced by the nearest orthonormal one (SVD). Raises `CaptureError` if an entry is not
@@ -268,7 +285,7 @@ def to_rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3
     elif np.linalg.det(matrix[:3, :3]) < 0:
         problem = "a pose that mirrors the world"
     if problem:
-        raise BadPose(f"{file}: {label} has {problem}. The file is damaged or of another convention.")
+        raise BadPose(f"{file}: {label} has {problem}. {remedy}")
     left, _, right = np.linalg.svd(matrix[:3, :3])
     result = np.eye(4)
     result[:3, :3] = left @ right

@@ -14,7 +14,7 @@ import numpy as np
 
 from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import (
-    OPENGL_FROM_OPENCV,
+    camera_motion,
     get_frames,
     parse_intrinsics,
     parse_matrix,
@@ -89,8 +89,8 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
             continue
         short += image.suffix if image.stem == PurePosixPath(short).name else ""
         try:
-            matrix = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
-            in_file = to_rigid(matrix, file, f"frame {name!r}")
+            matrix = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}")
+            in_file = camera_motion(matrix, file, f"frame {name!r}")
         except BadPose as error:
             bad[short] = error
             continue

@@ -13,9 +13,9 @@ import numpy as np
 
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.colmap import rotation_from_quaternion
-from vdgs.captures.formats.photograph_sizes import photograph_sizes
+from vdgs.captures.formats.photograph_sizes import GIVE_ALIGNED, check_seen_inside, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
-from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.source_capture import Intrinsics, check_centered, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
@@ -66,12 +66,15 @@ def read(file: Path, options: CaptureOptions) -> Project:
             focals, radial = (shared[0], shared[2]), (*shared, 0.0)[4]
             middle = [0.0 if abs(c) > 0.25 * side else side / 2 for c, side in zip(shared[1::2], size, strict=True)]
             center = (shared[1] + middle[0], shared[3] + middle[1])
+            check_centered(center, size, file, name, GIVE_ALIGNED)
         lens = _lens(focals, center, size, radial, file, name)
         if isinstance(lens, str):
             refused.setdefault(lens, []).append(name)
             continue
         numbers, pixels = shown.get(index, ([], []))
         seen = np.array(pixels).reshape(-1, 2) + center
+        if not shared:  # who writes FixedK may count these from the corner too
+            check_seen_inside(seen, size, file, name)
         views.append(
             ProjectView(
                 names=(name,), camera_from_world=pose, intrinsics=lens, sightings=(np.array(numbers, np.int64), seen)

@@ -1,0 +1,115 @@
+"""Sets of Blender's scripts (transforms_train.json): written here as these write them, read as one scene."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.captures import TinyScene, assert_sees_the_scene
+from support.dataset_layouts import halves, write_blender
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+Change = Callable[[dict], None]
+
+
+@pytest.fixture
+def both(tmp_path: Path, scene: TinyScene) -> TinyScene:
+    return write_blender(tmp_path, *halves(scene))
+
+
+def change_files(root: Path, change: Change) -> None:
+    """Change what each pose file says of its frames."""
+    for file in root.glob("transforms_*.json"):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            change(frame)
+        file.write_text(json.dumps(content))
+
+
+def write_names(path: Callable[[str], str]) -> Change:
+    def change(frame: dict) -> None:
+        frame["file_path"] = path(frame["file_path"].removeprefix("./"))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "on_disk"),
+    [
+        (lambda name: f"./{name}", ".png"),
+        (lambda name: f"./{name.removesuffix('.png')}", ".png"),
+        (lambda name: f"./{name.removesuffix('.png')}", ".JPG"),
+        (lambda name: f"./{name.removesuffix('.png')}", ".tif"),
+        (lambda name: name.replace(".png", ".jpg"), ".JPG"),
+        (lambda name: "C:\\Users\\me\\" + name, ".png"),
+        (lambda name: f"/home/me/set/{name}", ".png"),
+        (lambda name: f"file:///home/me/set/{name}", ".png"),
+        (lambda name: f"../{name}".replace("/", "\\"), ".png"),
+    ],
+)
+def test_names_are_found_as_in_transforms_json(tmp_path, both, name, on_disk):
+    """Without extension, in other case, and by paths of other machines; train and test have photographs of one name."""
+    change_files(tmp_path, write_names(name))
+    for image in (*tmp_path.glob("train/*.png"), *tmp_path.glob("test/*.png")):
+        image.rename(image.with_suffix(on_disk))
+    capture = load_capture(tmp_path)
+    assert [len(capture.train_views), len(capture.test_views)] == [9, 3]
+    assert_sees_the_scene(capture, both, lambda view: view.replace(on_disk, ".png"))
+
+
+def test_names_without_extension_may_hold_a_dot(tmp_path, both):
+    change_files(tmp_path, write_names(lambda name: name.removesuffix(".png").replace("/", "/v1.2_")))
+    for image in (*tmp_path.glob("train/*.png"), *tmp_path.glob("test/*.png")):
+        image.rename(image.with_name(f"v1.2_{image.name}"))
+    assert_sees_the_scene(load_capture(tmp_path), both, lambda view: view.replace("v1.2_", ""))
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_photographs_may_lie_in_another_folder(tmp_path, both, inside):
+    """The remedy that the error names works, and the error speaks of no archives, which such sets do not have."""
+    place = tmp_path / "set" if inside else tmp_path.parent / f"{tmp_path.name}-elsewhere"
+    place.mkdir()
+    for side in ("train", "test"):
+        (tmp_path / side).rename(place / side)
+    with pytest.raises(CaptureError, match=r"12 of 12 images .* are missing(?s:.)*train/0003\.png") as error:
+        load_capture(tmp_path)
+    assert ".tar" not in str(error.value)
+    capture = load_capture(tmp_path, CaptureOptions(images="set" if inside else str(place)))
+    assert_sees_the_scene(capture, both)
+
+
+def test_one_photograph_is_not_taken_for_two_of_its_name(tmp_path, both):
+    """In the folder of the training photographs, 0001.png is none of the test photographs."""
+    with pytest.raises(
+        CaptureError, match=r"train/0000\.png and test/0000\.png would both be .*folder above .*--images"
+    ):
+        load_capture(tmp_path, CaptureOptions(images="train"))
+
+
+def test_a_test_file_without_frames_is_none(tmp_path, both):
+    file = tmp_path / "transforms_test.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"frames": []}))
+    capture = load_capture(tmp_path)
+    assert len(capture.views) == 9
+    assert len(capture.test_views) > 0
+    (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": []}))
+    with pytest.raises(CaptureError, match=r"transforms_train\.json: must hold a list 'frames'"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.5, 30.0])
+def test_scaled_cameras_are_the_same_cameras(tmp_path, both, scale):
+    """At 0.01 too, which is the scale of MatrixCity's rotations; a script may have scaled some only."""
+
+    def enlarge(frame: dict) -> None:
+        if int(Path(frame["file_path"]).stem) % 2:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([scale] * 3 + [1])).tolist()
+
+    change_files(tmp_path, enlarge)
+    assert_sees_the_scene(load_capture(tmp_path), both)
