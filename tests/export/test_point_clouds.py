@@ -1,6 +1,8 @@
 """Point clouds for other programs: PLY, LAS and LAZ, read back by laspy and by our own reader of captures."""
 
 import importlib.util
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,6 +43,9 @@ def test_without_a_map_coordinates_are_local(tmp_path):
     read = laspy.read(tmp_path / "a.laz")
     np.testing.assert_allclose(read.xyz, some.means.numpy(), atol=0.00051)
     assert read.header.parse_crs() is None
+    place = (48.1, 11.6, 512.0)
+    registry.write_scene(tmp_path / "a.las", replace(ExportScene.of(some), metadata=ExportMetadata(geodetic=place)))
+    assert json.loads((tmp_path / "a.las.json").read_text())["geodetic"] == list(place)
 
 
 def test_a_wrong_map_is_refused_before_work(tmp_path):

@@ -408,6 +408,16 @@ def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
         open_tree(opened)
 
 
+def test_no_tree_is_made_of_a_damaged_model(coarse):
+    file = coarse.run.coarse.model
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(VdgsError, match=r"damaged or incomplete"):
+        build_lod.build_lod(coarse, LodRequest(run=coarse.run.path), Console())
+    assert not list(coarse.run.path.rglob("lod/**/*.safetensors"))
+
+
 def test_a_disk_without_room_is_said_before_anything_is_written(coarse, monkeypatch):
     monkeypatch.setattr(build_lod.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(VdgsError, match=r"takes up to .* and .* are free"):

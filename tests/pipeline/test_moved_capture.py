@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from contextlib import contextmanager
 from dataclasses import replace
@@ -121,6 +122,17 @@ def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp
         ours, theirs = (sorted((tmp_path / each.name / views).glob("*.png")) for each in (trained, folder))
         assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
         assert ours
+
+
+@pytest.mark.parametrize("mode", ["rgb", "depth"])
+def test_frames_that_show_nothing_of_the_scene_are_said(trained, tmp_path, mode):
+    away = [{"position": [1e4 + k, 1e4, 50.0], "look_at": [2e4, 2e4, 50.0], "fov_deg": 60.0} for k in range(2)]
+    (tmp_path / "away.json").write_text(json.dumps(away), encoding="utf-16")
+    console = Console(record=True, width=500)
+    request = RenderRequest(run=trained / "run", output=tmp_path / "out", path=tmp_path / "away.json", mode=mode)
+    render_run(replace(request, seconds=0.1, fps=20, device="cpu"), console)
+    assert "2 frames of 2 (first" in (said := console.export_text())
+    assert "show nothing of the scene" in said
 
 
 def test_films_and_pictures_fade_out_where_few_cameras_see(trained, tmp_path, monkeypatch):

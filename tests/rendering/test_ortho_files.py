@@ -29,8 +29,8 @@ pytest.importorskip("pyproj")
         ({"bbox": (5.0, 0.0, 1.0, 3.0)}, "--bbox 5 0 1 3: must be"),
         ({"gsd": 1e-6}, r"more than 1e\+10\. Give --gsd 0\.00018 or larger"),
         (
-            {"bbox": (0.0, 0.0, 10.0, 10.0), "gsd": 0.5},
-            "0 0 10 10: lies beside the scene, which spans 3812",
+            {"bbox": (0.0, 0.0, 10.0, 10.0), "gsd": 0.7},
+            "0 0 10 10: lies beside the scene, which spans 3812.*Longitudes and latitudes",
         ),
         ({"crs": "EPSG:4978"}, "does not point up"),
         ({"crs": "EPSG:4326"}, "degrees"),

@@ -115,6 +115,12 @@ def test_a_file_that_does_not_work_is_explained(text, says, tmp_path):
     assert says in str(raised.value)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_files_are_read_as_programs_on_windows_save_them(encoding, tmp_path):
+    (tmp_path / "settings.yaml").write_text("# der Größe nach\ntraining: {seed: 7}\n", encoding=encoding)
+    assert read(tmp_path / "settings.yaml")[1].training.seed == 7
+
+
 def test_a_file_without_settings_changes_none(tmp_path):
     (tmp_path / "empty.yaml").write_text("# nothing\n")
     assert read(tmp_path / "empty.yaml") == (CaptureOptions(), MethodConfig())

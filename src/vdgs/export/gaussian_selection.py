@@ -45,7 +45,9 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
     if request.bbox is not None:
         x0, y0, x1, y1 = request.bbox
         if not (x0 < x1 and y0 < y1):
-            raise VdgsError(f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
+            raise VdgsError(
+                f"--bbox {x0:.12g} {y0:.12g} {x1:.12g} {y1:.12g}: is empty. Give X0 Y0 X1 Y1, the lower corner first."
+            )
         crs = request.crs or default_crs(run.capture.ground, request.output[0])
         inside = MapProjection.of(run.capture.ground, crs).project(
             gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
@@ -54,7 +56,7 @@ def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: E
         if not wanted.any():
             low, high = inside[pixels > 0, :2].min(0), inside[pixels > 0, :2].max(0)
             raise VdgsError(
-                f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: holds nothing of the scene, which lies within "
+                f"--bbox {x0:.12g} {y0:.12g} {x1:.12g} {y1:.12g}: holds nothing of the scene, which lies within "
                 f"{low[0]:.1f} {low[1]:.1f} {high[0]:.1f} {high[1]:.1f} of --crs {crs or 'UTM'}."
             )
     kept = np.flatnonzero(wanted)

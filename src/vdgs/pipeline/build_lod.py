@@ -38,7 +38,7 @@ from vdgs.model.lod_nodes import (
 from vdgs.model.lod_quadtree import Quadtree, build_quadtree
 from vdgs.model.lod_scene import model_of_rows
 from vdgs.runs.lod_status import lod_folder
-from vdgs.runs.model_integrity import map_verified
+from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.stage_folder import StatusRecord
@@ -66,7 +66,7 @@ def build_lod(context: RunContext, request: LodRequest, console: Console) -> Pat
             return folder.path
         reset_peak_memory()
         began = time.monotonic()
-        model = map_verified(location.stage, location.key)
+        model = load_verified(location.stage, location.key)  # a tree of a damaged model would outlive the damage
         if not len(model.anchors):
             raise RunError(f"{location.stage.model}: holds no anchors, so that there is nothing to make a tree of.")
         folder.reset_unless(_key(model_id))

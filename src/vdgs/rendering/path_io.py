@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.text_tables import decode_text
 from vdgs.config import commands
 from vdgs.config.ranges import Range
 from vdgs.config.serialization import suggest
@@ -109,13 +110,15 @@ def load_path(
 
 def _read(file: Path) -> Mapping[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
+        content = json.loads(decode_text(file.read_bytes()))
     except FileNotFoundError as error:
         raise VdgsError(f"{file}: no such camera path.") from error
     except OSError as error:
         raise VdgsError(f"{file}: cannot be read ({error.strerror or error}).") from error
     except (ValueError, RecursionError) as error:
-        raise VdgsError(f"{file} is not a camera path in JSON: {error}") from error
+        raise VdgsError(
+            f"{file}: is not a camera path in JSON ({error}). Save it anew from the viewer, or mend that place."
+        ) from error
     if isinstance(content, list):
         content = {"keyframes": content}
     if not isinstance(content, Mapping):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -56,6 +56,8 @@ class _Render:
     run_cameras: RunCameras
     named: list[tuple[str, Camera]]
     console: Console
+    #: Frames that show nothing of the scene, as they are drawn.
+    empty: list[str] = field(default_factory=list)
 
     def scalar_map(self) -> ScalarMap | None:
         """The map that all views are drawn as; None for color images."""
@@ -71,11 +73,31 @@ class _Render:
         for name, camera in track(self.named, "rendering", len(self.named), self.console):
             check_stop_requested()
             if scalar_map is None:
-                yield name, to_8bit(render(shown, camera).image.cpu().numpy()), None
+                drawn = render(shown, camera)
+                self._note_empty(name, bool(drawn.alpha.any()))
+                yield name, to_8bit(drawn.image.cpu().numpy()), None
                 continue
             values = scalar_map.values(camera)
+            self._note_empty(name, bool((np.isfinite(values) & (values != 0)).any()))
             image = scalar_map.scale.colorize(values)
             yield name, add_colorbar(image, scalar_map.scale) if self.request.colorbar else image, values
+
+    def _note_empty(self, name: str, shows: bool) -> None:
+        if not shows:
+            self.empty.append(name)
+
+    def warn_of_empty(self) -> None:
+        """Say that frames show nothing: a path in other coordinates looks past the scene."""
+        if not self.empty:
+            return
+        places = np.array([camera.position for camera in self.run_cameras.cameras])
+        lowest, highest = places.min(axis=0), places.max(axis=0)
+        span = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", lowest, highest, strict=True))
+        self.console.print(
+            f"[yellow]warning[/] {_frame_count_text(len(self.empty))} of {len(self.named):,} (first {self.empty[0]}) "
+            f"show nothing of the scene: its cameras are at {span} of the ground frame. Are those of the path in it?",
+            highlight=False,
+        )
 
 
 def render_run(request: RenderRequest, console: Console) -> None:
@@ -101,6 +123,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     _check_size(request, [camera for _, camera in named])
     job = _Render(request=request, run=run, scene=scene, run_cameras=run_cameras, named=named, console=console)
     summary = _write_video(job, fps) if request.output.suffix else _write_images(job)
+    job.warn_of_empty()
     seconds = time.monotonic() - began
     console.print(f"{run.summary}: {summary}, drawn in {seconds:.1f} s: {request.output}", highlight=False)
 

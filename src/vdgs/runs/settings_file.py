@@ -32,8 +32,10 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
     """
     if path.is_dir():
         raise VdgsError(f"{path}: is a folder. Give a file of settings: vdgs config --output settings.yaml")
+    from vdgs.captures.text_tables import decode_text  # not before a file is asked for: it loads readers of images
+
     try:
-        content = load_yaml(path.read_text(encoding="utf-8-sig")) or {}
+        content = load_yaml(decode_text(path.read_bytes())) or {}
     except (OSError, yaml.YAMLError, RecursionError, ValueError) as error:
         raise VdgsError(f"{path}: cannot be read as YAML ({error})") from error
     if not isinstance(content, Mapping):

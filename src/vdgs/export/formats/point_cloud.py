@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, base_colors, opacities, to_uint8
+from vdgs.export.formats.axes import Z_UP
+from vdgs.export.formats.export_scene import (
+    ExportMetadata,
+    ExportScene,
+    base_colors,
+    opacities,
+    to_uint8,
+    write_metadata_file,
+)
 from vdgs.export.formats.gaussian_ply import write_vertices
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
@@ -55,7 +63,8 @@ def check_las_dependencies(path: Path, scene: ExportScene) -> None:
 
 
 def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
-    """Write a LAS 1.4 or, by the ending, LAZ file at origin + local coordinates, atomically, with the CRS as WKT.
+    """Write a LAS 1.4 or, by the ending, LAZ file at origin + local coordinates, atomically, with the CRS as WKT; where
+    there is none, the place of the origin stands in a `FILE.json` beside it.
 
     Returns what was lost. Raises VdgsError.
     """
@@ -75,6 +84,8 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
                                                 opacities(piece), header))  # fmt: skip
 
     write_atomic(path, write)
+    if not scene.metadata.crs:
+        write_metadata_file(path, scene.metadata, Z_UP)
     return LOSS_NOTES
 
 

@@ -74,7 +74,7 @@ class OrthoPlan:
         finest = pixel_grid.ground_sampling_distance(capture, scale)
         extent = pixel_grid.capture_extent(capture, placement)
         grid = pixel_grid.grid_from_bbox(request.bbox or extent, finest if request.gsd is None else request.gsd)
-        pixel_grid.check_grid_overlap(grid, extent, placement)
+        pixel_grid.check_overlap(request.bbox or extent, extent, placement)
         above = NadirCamera.of(capture, placement)
         above.camera(grid.subgrid(0, 0, 1, 1))  # a system that makes no map is refused here
         return OrthoPlan(

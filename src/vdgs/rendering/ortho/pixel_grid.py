@@ -70,7 +70,7 @@ def grid_from_bbox(bbox: tuple[float, float, float, float], gsd: float) -> Pixel
     if not (math.isfinite(gsd) and gsd > 0):
         raise VdgsError(f"--gsd {gsd}: a pixel needs a size above 0.")
     if not (all(map(math.isfinite, bbox)) and x0 < x1 and y0 < y1):
-        raise VdgsError(f"--bbox {' '.join(f'{v:g}' for v in bbox)}: must be X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1.")
+        raise VdgsError(f"--bbox {' '.join(f'{v:.12g}' for v in bbox)}: must be X0 Y0 X1 Y1 with X0 < X1 and Y0 < Y1.")
     # A box that ends on a line, but for rounding, ends there.
     left, bottom = math.floor(x0 / gsd + 1e-6), math.floor(y0 / gsd + 1e-6)
     right, top = math.ceil(x1 / gsd - 1e-6), math.ceil(y1 / gsd - 1e-6)
@@ -100,15 +100,19 @@ def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, f
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
 
 
-def check_grid_overlap(grid: PixelGrid, extent: tuple[float, float, float, float], placement: MapProjection) -> None:
-    """Raise VdgsError where a grid lies wholly beside what the photographs show, by more than that is wide."""
+def check_overlap(
+    bbox: tuple[float, float, float, float], extent: tuple[float, float, float, float], placement: MapProjection
+) -> None:
+    """Raise VdgsError where a box lies wholly beside what the photographs show, by more than that is wide."""
     x0, y0, x1, y1 = extent
-    left, bottom, right, top = grid.bounds
+    left, bottom, right, top = bbox
     width, height = x1 - x0, y1 - y0
     if left > x1 + width or right < x0 - width or bottom > y1 + height or top < y0 - height:
+        in_degrees = max(map(abs, (left, right))) <= 180 and max(map(abs, (bottom, top))) <= 90 and abs(y0) > 90
         raise VdgsError(
-            f"--bbox {' '.join(f'{v:g}' for v in grid.bounds)}: lies beside the scene, which spans "
+            f"--bbox {' '.join(f'{v:.12g}' for v in bbox)}: lies beside the scene, which spans "
             f"{' '.join(f'{v:.1f}' for v in extent)} in {placement.name}."
+            + (" Longitudes and latitudes? Give the box in that system." if in_degrees else "")
         )
 
 
