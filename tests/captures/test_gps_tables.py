@@ -205,11 +205,13 @@ def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
     assert any("gives no altitude for 0.jpg" in note for note in found.notes)
 
 
-@pytest.mark.parametrize(("altitude", "said"), [("{0}", ""), ("{1}", "450 m below"), ("{2}", "60 m above")])
+@pytest.mark.parametrize(
+    ("altitude", "said"), [("{0}", ""), ("{1}", "450 m below"), ("{2}", "60 m above"), ("{3}", "348 m below")]
+)
 def test_altitudes_of_a_table_that_are_not_those_of_the_photographs_are_said(tmp_path, altitude, said):
     seen = [replace(photo, lat_lon=(-33.5, -70.6 + k / 1e4), altitude=500.0 + k)
             for k, photo in enumerate(photographs(tmp_path, NAMES))]  # fmt: skip
-    rows = [f"{photo.name},-33.5,{photo.lat_lon[1]},{altitude}".format(500 + k, 50 + k, 560 + k)
+    rows = [f"{photo.name},-33.5,{photo.lat_lon[1]},{altitude}".format(500 + k, 50 + k, 560 + k, 152.4 + k)
             for k, photo in enumerate(seen)]  # fmt: skip
     (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt", *rows]))
     notes = read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)).notes

@@ -12,8 +12,10 @@ from vdgs.errors import CaptureError
 
 #: An altitude of exactly 0 among others that are farther from it (metres) is a default (choice).
 FAR_FROM_ZERO_M = 30.0
-#: Altitudes are the same but for their unit where they differ by less than this share of the heights (choice).
-SAME_HEIGHT = 0.1
+#: Differences of altitudes are the same but for their unit where they differ by less than this share (choice).
+SAME_RELIEF = 0.1
+#: Cameras whose heights differ by more than this (metres) tell altitudes in feet from those in metres.
+LEAST_RELIEF_M = 2.5
 
 
 def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -34,11 +36,14 @@ def without_zero_altitudes(geodetic: np.ndarray, known: np.ndarray) -> np.ndarra
 
 
 def wrong_unit(altitudes: np.ndarray, heights: np.ndarray) -> str:
-    """ "feet" where altitudes [n] that are said to be metres are the `heights` [n] in feet, "metres" the other way
-    around, empty where neither holds."""
+    """The unit of altitudes [n] that are taken for another: feet where they differ as `heights` [n] in feet do, over
+    any zero, metres the other way around; empty where neither holds, or heights do not differ enough to tell."""
+    if np.ptp(heights) < LEAST_RELIEF_M:
+        return ""
+    altitudes, heights = altitudes - np.median(altitudes), heights - np.median(heights)
     size = float(np.median(np.abs(heights)))
     for factor, unit in ((1 / FOOT_M, "feet"), (FOOT_M, "metres")):
-        if size > 0 and float(np.median(np.abs(altitudes / factor - heights))) < SAME_HEIGHT * size:
+        if size > 0 and float(np.median(np.abs(altitudes / factor - heights))) < SAME_RELIEF * size:
             return unit
     return ""
 

@@ -47,8 +47,6 @@ FAR_FROM_ORIGIN_M = 1000.0
 MAX_ENU_DISTANCE_M = 50_000.0
 #: A told up axis farther than this from the estimated one is worth a warning.
 MAX_UP_DEVIATION_DEG = 30.0
-#: Cameras whose heights differ by more than this (metres) tell altitudes in feet from those in metres.
-LEAST_RELIEF_M = 3.0
 AXES = {
     sign + name: factor * np.eye(3)[index]
     for index, name in enumerate("xyz")
@@ -203,9 +201,7 @@ def _fit_table(problem: Problem, altitudes: np.ndarray, file: Path, warnings: li
     fit = fit_positions(problem)
     if fit.altitude in ("unused", "drifts"):
         heights = fit.placed[:, 2]
-        spread = heights - np.median(heights)
-        if np.ptp(heights) > LEAST_RELIEF_M:
-            refuse_unit(wrong_unit(altitudes - np.median(altitudes), spread), "the cameras", file)
+        refuse_unit(wrong_unit(altitudes, heights), "the cameras", file)
         if not np.ptp(altitudes):
             warnings.append(
                 f"{file.name}: its altitudes are all {altitudes[0]:g} m, but the cameras' heights differ by "

@@ -263,7 +263,7 @@ def _other_altitudes(rows: Mapping[int, GpsRow], photographs: Sequence[ImageMeta
     way = "above" if off > 0 else "below"
     return [
         f"{table.name}: its altitudes lie {abs(off):,.0f} m {way} those in the photographs, "
-        "and are used all the same. Over the ground, or over another zero, as that of the ellipsoid?"
+        "and are used all the same. Over the ground, in feet, or over another zero (the ellipsoid's)?"
     ]
 
 
