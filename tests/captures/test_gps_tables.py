@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from support.flights import write_photograph
+from support.flights import small_photographs
 from vdgs.captures.coordinate_systems import to_geodetic
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.sfm.gps_priors import read_gps_priors
-from vdgs.sfm.image_metadata import read_image_metadata
 
-NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 PLACE = (-33.5, -70.6, 500.0)
 EASTING, NORTHING = 351375.7913, 6292135.2282  # of zone 19 south
 
@@ -179,74 +176,8 @@ def test_tables_of_spreadsheets_that_write_no_unicode_are_read(tmp_path, text, e
 NAMES = [f"{k}.jpg" for k in range(4)]
 
 
-def photographs(folder, names):
-    for k, name in enumerate(names):
-        pixels = np.roll(NOISE, k, axis=0)
-        write_photograph(folder / name, pixels, k, None, xmp=f'drone-dji:RelativeAltitude="+{40 + k}.0"')
-    return [read_image_metadata(folder / name, name) for name in names]
-
-
-def test_altitudes_that_a_table_lacks_are_those_of_the_photographs(tmp_path):
-    seen = photographs(tmp_path, [f"{k}.jpg" for k in range(4)])
-    file = tmp_path / "gps.csv"
-    file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,-33.5{k},-70.6,\n" for k in range(4)))
-    assert all(math.isnan(row.position[2]) for row in read_gps_table(file).rows)
-    rasters = tmp_path / "rasters.csv"
-    for unit in (" [ft]", ""):
-        rasters.write_text(file.read_text().replace("-70.6,", "-70.6,-9999").replace("alt", f"alt{unit}"))
-        assert all(math.isnan(row.position[2]) for row in read_gps_table(rasters).rows)
-    found = read_gps_priors(seen, file, (1.0, 2.0))
-    assert len(found) == 4
-    for latitude, says in ((-33.5, False), (-34.5, True)):
-        placed = [replace(photo, lat_lon=(latitude, -70.6)) for photo in seen]
-        notes = read_gps_priors(placed, rasters, (1.0, 2.0)).notes
-        assert any("rasters.csv: its positions lie 109 km from those in" in note for note in notes) is says
-    assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.6)
-    assert any("gives no altitude for 0.jpg" in note for note in found.notes)
-
-
-@pytest.mark.parametrize(
-    ("altitude", "said"), [("{0}", ""), ("{1}", "450 m below"), ("{2}", "60 m above"), ("{3}", "348 m below")]
-)
-def test_altitudes_of_a_table_that_are_not_those_of_the_photographs_are_said(tmp_path, altitude, said):
-    seen = [replace(photo, lat_lon=(-33.5, -70.6 + k / 1e4), altitude=500.0 + k)
-            for k, photo in enumerate(photographs(tmp_path, NAMES))]  # fmt: skip
-    rows = [f"{photo.name},-33.5,{photo.lat_lon[1]},{altitude}".format(500 + k, 50 + k, 560 + k, 152.4 + k)
-            for k, photo in enumerate(seen)]  # fmt: skip
-    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt", *rows]))
-    notes = read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)).notes
-    assert any(said in note and "those in the photographs" in note for note in notes) is bool(said)
-
-
-def test_altitudes_of_a_table_that_are_those_of_the_photographs_in_feet_are_refused(tmp_path):
-    seen = [replace(photo, lat_lon=(-33.5, -70.6 + k / 1e4), altitude=500.0 + k)
-            for k, photo in enumerate(photographs(tmp_path, NAMES))]  # fmt: skip
-    rows = [f"{photo.name},-33.5,{photo.lat_lon[1]},{photo.altitude / 0.3048}" for photo in seen]
-    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt", *rows]))
-    with pytest.raises(CaptureError, match=r"gps\.csv: its altitudes are in feet"):
-        read_gps_priors(seen, tmp_path / "gps.csv", (1, 2))
-    (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt_ft", *rows]))
-    assert read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)).origin[2] == pytest.approx(501.5, abs=1)
-
-
-def test_positions_without_any_altitude_count_in_the_plane(tmp_path):
-    seen = [replace(photo, relative_altitude=None) for photo in photographs(tmp_path, NAMES)]
-    (tmp_path / "gps.csv").write_text("name,lat,lon\n" + "".join(f"{k}.jpg,-33.5{k},-70.6\n" for k in range(4)))
-    tagged = [replace(photo, lat_lon=(-33.5 - k / 100, -70.6), altitude=None) for k, photo in enumerate(seen)]
-    for found in (read_gps_priors(seen, tmp_path / "gps.csv", (1, 2)), read_gps_priors(tagged, None, (1, 2))):
-        assert len(found) == 4
-        assert not found.has_altitudes
-        assert found.origin == pytest.approx((-33.515, -70.6, 0))
-        assert np.abs(found.enu[:, 2]).max() < 1  # the Earth is round
-        assert any("no altitudes" in note for note in found.notes)
-    some = [replace(photo, altitude=2500.0 + k if k else None) for k, photo in enumerate(tagged)]
-    found = read_gps_priors(some, None, (1, 2))
-    assert found.image_indices.tolist() == [1, 2, 3]
-    assert found.has_altitudes
-
-
 def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
-    seen = photographs(tmp_path, [f"{k}.jpg" for k in range(4)])
+    seen = small_photographs(tmp_path, [f"{k}.jpg" for k in range(4)])
     file = tmp_path / "gps.csv"
     rows = [f"{k}.jpg,-33.5{k},-70.6,500,0.5,1.5\n" for k in range(7)]
     file.write_text("name,lat,lon,alt,accuracy_horizontal,accuracy_vertical\n" + "".join(rows) + "9.jpg,,,\n")
@@ -267,7 +198,8 @@ def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
 )
 def test_a_table_that_contradicts_the_photographs_is_refused_with_what_is_exchanged(tmp_path, row, said):
     file = tmp_path / "gps.csv"
-    seen = [replace(photo, lat_lon=(-33.5 - k / 1000, -70.6)) for k, photo in enumerate(photographs(tmp_path, NAMES))]
+    taken = small_photographs(tmp_path, NAMES)
+    seen = [replace(photo, lat_lon=(-33.5 - k / 1000, -70.6)) for k, photo in enumerate(taken)]
     for written, refused in (("{0},{1}", False), (row, True)):
         lines = [written.format(-33.5 - k / 1000, -70.6, 33.5 + k / 1000, 70.6) for k in range(4)]
         file.write_text("name,lat,lon,alt\n" + "".join(f"{k}.jpg,{line},500\n" for k, line in enumerate(lines)))
@@ -279,7 +211,7 @@ def test_a_table_that_contradicts_the_photographs_is_refused_with_what_is_exchan
 
 
 def test_a_flight_across_the_antimeridian_holds_together(tmp_path):
-    seen = photographs(tmp_path, NAMES)
+    seen = small_photographs(tmp_path, NAMES)
     places = [(-17 - k / 10000, (179.9999 + k / 15000 + 180) % 360 - 180) for k in range(4)]
     (tmp_path / "gps.csv").write_text(
         "name,lat,lon,alt\n" + "".join(f"{k}.jpg,{lat},{lon % 360},5\n" for k, (lat, lon) in enumerate(places))
@@ -487,34 +419,8 @@ def test_what_a_national_datum_costs_is_stated(tmp_path, system, x, y, error_m, 
     assert sum("WGS 84" in note for note in table.notes) == bool(said)
 
 
-@pytest.mark.parametrize("altitude", [0.0, None])
-def test_altitudes_that_are_all_zero_are_a_default(tmp_path, altitude):
-    seen = photographs(tmp_path, NAMES)
-    seen = [replace(photo, lat_lon=(-33.5 - k / 1000, -70.6), altitude=altitude) for k, photo in enumerate(seen)]
-    found = read_gps_priors(seen, None, (1.0, 2.0))
-    assert np.ptp(found.enu[:, 2]) == pytest.approx(3, abs=0.1)
-    assert found.altitude_reference == "above the take-off, by XMP"
-    assert any("exactly 0" in note for note in found.notes)
-
-
-def test_altitudes_of_exactly_zero_among_others_are_none(tmp_path):
-    seen = photographs(tmp_path, [f"{k}.jpg" for k in range(8)])
-    heights = [0.0, 501, 502, 503, 504, 505, 506, 507]
-    seen = [
-        replace(photo, lat_lon=(-33.5 - k / 1000, -70.6), altitude=height)
-        for k, (photo, height) in enumerate(zip(seen, heights, strict=True))
-    ]
-    found = read_gps_priors(seen, None, (1.0, 2.0))
-    assert found.image_indices.tolist() == list(range(1, 8))
-    assert any("0.jpg: the position has no altitude; not used" in note for note in found.notes)
-    beach = [replace(photo, altitude=float(k)) for k, photo in enumerate(seen)]
-    assert len(read_gps_priors(beach, None, (1.0, 2.0))) == 8
-    none = [replace(photo, altitude=0.0, relative_altitude=None) for photo in seen]
-    assert not read_gps_priors(none, None, (1.0, 2.0)).has_altitudes
-
-
 def test_moments_of_a_drone_are_matched_by_number(tmp_path):
-    seen = photographs(tmp_path, [f"DJI_2026_{k:04d}_V.jpg" for k in range(1, 5)])
+    seen = small_photographs(tmp_path, [f"DJI_2026_{k:04d}_V.jpg" for k in range(1, 5)])
     file = tmp_path / "flight.MRK"
     line = "{}\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5{},Lat\t-70.6,Lon\t500,Ellh\t0.01, 0.02, 0.03\t50,Q\n"
     file.write_text("".join(line.format(k, k) for k in range(1, 5)))

@@ -21,6 +21,7 @@ from support.commands import small_figures
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.sfm.image_metadata import ImageMetadata, read_image_metadata
 from vdgs.synth.flight_cameras import pose_from_angles
 from vdgs.synth.image_renderer import render_image
 from vdgs.synth.lighting import SkyMap, make_sky_map
@@ -208,3 +209,12 @@ def sexagesimal(degrees: float) -> tuple[float, float, float]:
     whole = abs(degrees)
     minutes = (whole - int(whole)) * 60
     return float(int(whole)), float(int(minutes)), round((minutes - int(minutes)) * 60, 6)
+
+
+def small_photographs(folder: Path, names: Sequence[str]) -> list[ImageMetadata]:
+    """Photographs of noise without a position, which say that they were taken 40, 41, ... m over the take-off."""
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+    for k, name in enumerate(names):
+        pixels = np.roll(noise, k, axis=0)
+        write_photograph(folder / name, pixels, k, None, xmp=f'drone-dji:RelativeAltitude="+{40 + k}.0"')
+    return [read_image_metadata(folder / name, name) for name in names]

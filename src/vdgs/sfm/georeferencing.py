@@ -10,6 +10,7 @@ import numpy as np
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import Up
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
+from vdgs.captures.table_columns import FOOT_M
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, rotation_to_z
@@ -24,8 +25,6 @@ WITHOUT = (
     "give a known distance (--scale-bar), or the same command without --georeference off: the finished capture is "
     "placed anew in seconds."
 )
-#: Metres in a foot.
-FOOT_M = 0.3048
 #: Control points and scene disagree if a fit leaves them farther off (RMS) than this share of their spread (choice).
 MOST_OFF = 0.1
 #: Up by control points and by the photographs may differ by so many degrees (choice).
