@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.flights import small_photographs
-from vdgs.captures.coordinate_systems import to_geodetic
+from vdgs.captures.coordinate_systems import datum_error, to_geodetic
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -438,6 +438,20 @@ def test_a_table_of_several_systems_is_refused_and_blank_cells_are_none(tmp_path
     (tmp_path / "t.csv").write_text(text.format("EPSG:32632"))
     with pytest.raises(CaptureError, match="several coordinate systems"):
         read_gps_table(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("axes", ["", ',AXIS["Lat",NORTH],AXIS["Lon",EAST]', ',AXIS["Lon",EAST],AXIS["Lat",NORTH]'])
+@pytest.mark.parametrize("heights", [False, True])
+@pytest.mark.parametrize("shift", ["", "TOWGS84[0,0,0,0,0,0,0],"])
+def test_longitude_stays_longitude_however_a_system_is_written(tmp_path, axes, heights, shift):
+    pytest.importorskip("pyproj")
+    wkt = f'GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563],{shift}'
+    wkt += f'AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328]{axes}]'
+    if heights:
+        wkt = f'COMPD_CS["both",{wkt},VERT_CS["EGM96 height",VERT_DATUM["EGM96 geoid",2005],UNIT["metre",1]]]'
+    change, _ = to_geodetic(wkt, tmp_path)
+    assert change(np.array([[-70.6, -33.5, 500]]))[0, :2] == pytest.approx((-33.5, -70.6))
+    assert datum_error(wkt, np.array([[-33.5, -70.6, 500]])) == (0.0, "")
 
 
 @pytest.mark.parametrize("name", ["site1_UTM33_0001.JPG", "UTM_0001.JPG", "SRID0001.JPG", "EPSG12_1.jpg"])

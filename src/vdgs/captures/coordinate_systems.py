@@ -94,7 +94,7 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
     try:
         crs = pyproj.CRS.from_user_input(_named(header))
         flat = len(crs.axis_info) == 2
-        change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
+        change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979")
     except pyproj.exceptions.ProjError:
         raise UnknownSystem(
             f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
@@ -109,16 +109,17 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
                 f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} look like degrees, but {crs.name} ({where}) "
                 "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
             )
+        first, second = (y, x) if _counts_north_first(crs) else (x, y)
         if flat:  # heights are metres as they are, whatever they are measured from
-            longitude, latitude = change.transform(x, y)
+            latitude, longitude = change.transform(first, second)
         else:
-            longitude, latitude, z = change.transform(x, y, z)
+            latitude, longitude, z = change.transform(first, second, z)
         return np.stack([latitude, longitude, z], axis=1)
 
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
         name += "; heights as they are, for PROJ lacks the grid of their geoid"
-    unknown = crs.datum is not None and not crs.is_bound and crs.datum.name.lower().startswith("unknown")
+    unknown = crs.datum is not None and not _says_its_shift(crs) and crs.datum.name.lower().startswith("unknown")
     ellipsoid = crs.ellipsoid.name if unknown and crs.ellipsoid is not None else "WGS 84"
     if ellipsoid not in _GLOBAL:
         name += (
@@ -129,6 +130,17 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
     return changed, f"{name}{HEIGHTS_IN_METERS}" if feet else name
 
 
+def _counts_north_first(crs: Any) -> bool:
+    """Whether the first axis of a system is north and the second east. (`always_xy` of pyproj does not see it where a
+    system with heights holds one with TOWGS84, as Metashape writes it.)"""
+    return [axis.direction.lower() for axis in crs.axis_info[:2]] == ["north", "east"]
+
+
+def _says_its_shift(crs: Any) -> bool:
+    """Whether a system gives the shift of its datum itself (TOWGS84), with heights or without."""
+    return bool(crs.is_bound or any(part.is_bound for part in crs.sub_crs_list))
+
+
 def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float, str]:
     """By how many metres places (latitude, longitude, height) may be off that `to_geodetic` brought to WGS 84 from the
     datum of their system, and that in words; 0 and none for datums that are WGS 84 but for a metre or two, and for
@@ -136,7 +148,7 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
     import pyproj
 
     crs = pyproj.CRS.from_user_input(_named(header))
-    if crs.is_bound or crs.geodetic_crs is None or not len(geodetic):
+    if _says_its_shift(crs) or crs.geodetic_crs is None or not len(geodetic):
         return 0.0, ""
     datum, (latitude, longitude) = crs.geodetic_crs.to_2d(), np.median(geodetic[:, :2], axis=0).tolist()
     if datum.is_geocentric:
