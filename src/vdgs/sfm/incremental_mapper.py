@@ -38,6 +38,9 @@ ORBIT_RADIUS_SHARE = 0.8
 FEW = 0.1
 #: Parts of fewer photographs than this are no model.
 MIN_MODEL_SIZE = 3
+#: All poses are adjusted whenever the model has grown so far, and at the end. Growth by a tenth, COLMAP's own, takes
+#: half as long again and ends at the same model (experiments/reports/photographs.md).
+GLOBAL_ADJUSTMENT_RATIO = 1.4
 #: What the mapper has is kept so many times on the way, each time by so many photographs more at least.
 MAX_SNAPSHOTS, MIN_SNAPSHOT_INTERVAL = 20, 5
 
@@ -94,7 +97,7 @@ def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str],
         return held
     model = models[0]
     images = [image for image in placed_images(model) if image.num_points3D]
-    heights = np.array([_height_over_points(image, model) for image in images])
+    heights = np.array([height_over_points(image, model) for image in images])
     views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     ahead = np.median(views, axis=0) / np.linalg.norm(np.median(views, axis=0))
     oblique = np.mean(views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG)))
@@ -108,7 +111,7 @@ def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str],
     return False, "several heights or views, as the photographs themselves show, which tell it"
 
 
-def _height_over_points(image: pycolmap.Image, model: pycolmap.Reconstruction) -> float:
+def height_over_points(image: pycolmap.Image, model: pycolmap.Reconstruction) -> float:
     """Median distance along the view to the points that an image shows."""
     seen = [model.points3D[each.point3D_id].xyz for each in image.points2D if each.has_point3D()]
     pose = image.cam_from_world().matrix()
@@ -195,7 +198,7 @@ def save_snapshots(workspace: Workspace) -> None:
         except OSError:  # a full disk: what was saved before stays
             shutil.rmtree(folder)
             continue
-        before, count = _largest_snapshot(workspace), _registered_count(folder)
+        before, count = _largest_snapshot(workspace), registered_count(folder)
         if before is None or count > int(before.name):
             workspace.saved_snapshots.mkdir(exist_ok=True)
             os.replace(folder, workspace.saved_snapshots / str(count))
@@ -215,7 +218,7 @@ def _largest_snapshot(workspace: Workspace) -> Path | None:
     return max(workspace.saved_snapshots.glob("*"), key=lambda folder: int(folder.name), default=None)
 
 
-def _registered_count(folder: Path) -> int:
+def registered_count(folder: Path) -> int:
     """Number of photographs that a written model places: the first eight bytes of its images."""
     with (folder / "images.bin").open("rb") as file:
         return int.from_bytes(file.read(8), "little")
@@ -248,6 +251,7 @@ def _options(fix_focal: bool, threads: int) -> pycolmap.IncrementalPipelineOptio
     options.use_prior_position = False  # poses come without trust in positions, which may be off by any amount
     # Its solver takes minutes for each photograph that does not fit, and finds none in overlapping flights.
     options.structure_less_registration_fallback = False
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
     # Points that two photographs see are where the edges of a flight, and few photographs, have any.
     options.triangulation.ignore_two_view_tracks = False
     return options

@@ -31,6 +31,7 @@ from vdgs.sfm import (
     feature_extraction,
     feature_matching,
     georegistration,
+    global_mapper,
     incremental_mapper,
     mask_files,
 )
@@ -310,6 +311,13 @@ def _models(
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
         workspace.finish("model", key)
+    if not workspace.is_done("joined", key):
+        if not workspace.is_begun("joined", key) and global_mapper.leaves_photographs_out(workspace):
+            incremental_mapper.set_models_aside(workspace)
+            workspace.begin("joined", key)
+        if workspace.is_begun("joined", key):
+            global_mapper.place_left_out(workspace, count, fix_focal, plan.threads, console)
+        workspace.finish("joined", key)
     if any(photo.sensor for photo in plan.image_list.images) and not workspace.is_done("rigs", key):
         if not workspace.is_begun("rigs", key):
             incremental_mapper.set_models_aside(workspace)

@@ -1,0 +1,151 @@
+"""Photographs that the incremental mapper leaves out, placed with all others at once by COLMAP's global mapper.
+
+The incremental mapper places one photograph after another, each by thirty points that are there already: where a flight
+overlaps little it ends in parts. The global mapper (GLOMAP, Pan et al. 2024) turns and moves all photographs together,
+by what their pairs say. Its model is refined by the incremental mapper, and believed only where the parts that this one
+had found keep their shape in it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from vdgs.captures.formats.colmap_writing import write_model_files
+from vdgs.geometry.similarity import fit_similarity_robust
+from vdgs.sfm import feature_matching, incremental_mapper
+from vdgs.sfm.capture_writer import placed_images
+from vdgs.sfm.image_metadata import EXACT_MODEL
+from vdgs.sfm.workspace import Workspace, report_progress
+from vdgs.system.lazy_pycolmap import pycolmap
+from vdgs.system.stop_signals import check_stop_requested
+
+#: Photographs are tried again where so large a share of those that match others is left out (choice).
+MIN_MISSING_SHARE = 0.03
+#: A photograph is held by so many points at least, as the incremental mapper asks for.
+MIN_POINTS = 30
+#: A part keeps its shape where its cameras move by no more than this share of their distance to what they see, and turn
+#: by no more degrees (RMS and median); smaller parts have little shape to keep (choices).
+MAX_MOVED_SHARE, MAX_TURNED_DEG, MIN_PART = 0.02, 1.0, 5
+#: Its points are seen where they were before, within so many pixels more.
+MAX_WORSE_PX = 0.1
+_POLL_SECONDS = 0.2
+
+
+def leaves_photographs_out(workspace: Workspace) -> bool:
+    """Whether enough photographs that match others are missing in the largest model, of cameras that the global mapper
+    may move and fit: not of rigs, and not of views that were cut out of panoramas."""
+    with workspace.open_database() as database:
+        fixed = any(rig.num_sensors() > 1 for rig in database.read_all_rigs()) or any(
+            camera.model_name == EXACT_MODEL for camera in database.read_all_cameras()
+        )
+    matched = {name for name, count in feature_matching.count_verified_matches(workspace).items() if count}
+    missing = matched - {image.name for image in placed_images(incremental_mapper.read_models(workspace)[0])}
+    return not fixed and len(missing) > MIN_MISSING_SHARE * len(matched)
+
+
+def place_left_out(workspace: Workspace, count: int, fix_focal: bool, threads: int, console: Console) -> None:
+    """Make models again, beginning with all photographs at once; those that were set aside (`set_models_aside`) are
+    taken back where that places no more photographs, or where it changes the shape of a part."""
+    parts = incremental_mapper.read_models(workspace, aside=True)
+    if _map_globally(workspace, count, len(placed_images(parts[0])), fix_focal, threads, console):
+        incremental_mapper.run_mapper(workspace, count, fix_focal, threads, console)
+        joined = incremental_mapper.read_models(workspace)[0]
+        _leave_weak_out(joined)
+        if len(placed_images(joined)) > len(placed_images(parts[0])) and all(
+            _keeps_shape(part, joined) for part in parts if part is parts[0] or len(placed_images(part)) >= MIN_PART
+        ):
+            shutil.rmtree(workspace.models)
+            write_model_files(joined, workspace.models / "0")
+            return
+    incremental_mapper.take_models_back(workspace)
+
+
+def _map_globally(
+    workspace: Workspace, count: int, placed: int, fix_focal: bool, threads: int, console: Console
+) -> bool:
+    """Put the largest model of the global mapper where the incremental one goes on from. False where there is none."""
+    if any(workspace.saved_snapshots.glob("*")):
+        return True
+    folder = workspace.path / "global"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    with report_progress(workspace, console, "mapping", count, f"{placed} placed, now all at once, ") as tell:
+        tell(placed)
+        # In a process of its own: the global mapper cannot be interrupted, and a failed check of it ends a process.
+        arguments = (workspace.database, workspace.images, folder, threads, int(fix_focal))
+        command = [sys.executable, "-m", __name__, *map(str, arguments)]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            while process.poll() is None:
+                time.sleep(_POLL_SECONDS)
+                check_stop_requested()
+        finally:
+            process.kill()
+            process.wait()
+    sizes = {each: incremental_mapper.registered_count(each) for each in folder.iterdir() if each.is_dir()}
+    if process.returncode or not sizes:
+        return False
+    largest = max(sizes, key=lambda each: sizes[each])
+    workspace.saved_snapshots.mkdir(exist_ok=True)
+    os.replace(largest, workspace.saved_snapshots / str(sizes[largest]))
+    shutil.rmtree(folder)
+    return True
+
+
+def map_globally(database: Path, images: Path, output: Path, threads: int, fix_focal: bool) -> None:
+    """Write the models of COLMAP's global mapper."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    options.min_model_size = incremental_mapper.MIN_MODEL_SIZE
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = not fix_focal
+    options.mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
+    options.mapper.retriangulation.ignore_two_view_tracks = False
+    pycolmap.global_mapping(database, images, output, options)
+
+
+def _leave_weak_out(model: pycolmap.Reconstruction) -> None:
+    for image in list(placed_images(model)):
+        if image.num_points3D < MIN_POINTS:
+            model.deregister_frame(image.frame_id)
+
+
+def _keeps_shape(part: pycolmap.Reconstruction, joined: pycolmap.Reconstruction) -> bool:
+    """Whether photographs of a part lie to each other as in a model of more of them, and show its points as well."""
+    before, after = (_by_name(placed_images(model)) for model in (part, joined))
+    names = sorted(before.keys() & after.keys())
+    if len(names) < max(3, (1 - MIN_MISSING_SHARE) * len(before)):
+        return False
+    centers, moved = (np.array([of[name].projection_center() for name in names]) for of in (before, after))
+    similarity, _ = fit_similarity_robust(moved, centers)
+    off = np.linalg.norm(similarity.apply(moved) - centers, axis=1)
+    away = np.median([incremental_mapper.height_over_points(before[name], part) for name in names])
+    turns = [
+        (before[name].cam_from_world().rotation.matrix() @ similarity.rotation).T
+        @ after[name].cam_from_world().rotation.matrix()
+        for name in names
+    ]
+    angles = np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    worse = joined.compute_mean_reprojection_error() - part.compute_mean_reprojection_error()
+    return bool(
+        np.sqrt((off**2).mean()) <= MAX_MOVED_SHARE * away
+        and np.median(angles) <= MAX_TURNED_DEG
+        and worse <= MAX_WORSE_PX
+    )
+
+
+def _by_name(images: Iterable[pycolmap.Image]) -> dict[str, pycolmap.Image]:
+    return {image.name: image for image in images}
+
+
+if __name__ == "__main__":
+    map_globally(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]), sys.argv[5] == "1")
