@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.flights import small_photographs
-from vdgs.captures.coordinate_systems import datum_error, to_geodetic
+from vdgs.captures.coordinate_systems import datum_error, names_a_system, to_geodetic
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -452,6 +452,16 @@ def test_longitude_stays_longitude_however_a_system_is_written(tmp_path, axes, h
     change, _ = to_geodetic(wkt, tmp_path)
     assert change(np.array([[-70.6, -33.5, 500]]))[0, :2] == pytest.approx((-33.5, -70.6))
     assert datum_error(wkt, np.array([[-33.5, -70.6, 500]])) == (0.0, "")
+
+
+def test_names_of_files_are_not_looked_up_among_systems(monkeypatch):
+    asked = []
+    monkeypatch.setattr("vdgs.captures.coordinate_systems._is_name", lambda words: bool(asked.append(words)))
+    assert not any(names_a_system(line) for line in ("test_0001.jpg", "east/DJI_0001.JPG", "IMG_1.tiff"))
+    assert not asked
+    names_a_system("NAD83(2011) / Conus Albers")
+    assert not names_a_system("Conus Albers")
+    assert asked == ["Conus Albers"]
 
 
 @pytest.mark.parametrize("name", ["site1_UTM33_0001.JPG", "UTM_0001.JPG", "SRID0001.JPG", "EPSG12_1.jpg"])

@@ -26,6 +26,8 @@ _CODES = re.compile(r"(?:EPSG|SRID)(?:\.io/|\.xml#|[\s:=_-]{0,3})(\d{4,6}(?:\+\d
 _WKT = re.compile(r"\w*(CS|CRS)\[", re.I)
 #: A line that may be a name alone: no table of words, no numbers on their own.
 _WORDS = re.compile(r"(?!.*(^|\s)[\d.]+\s+[\d.])[A-Za-z][^,;\t]{2,60}")
+#: Lists of photographs begin so; PROJ looks half a second for a name that it does not know.
+_FILE_NAME = re.compile(r"\.[A-Za-z]{2,5}$")
 #: What may stand around a name: quotes, and the separators by which spreadsheets fill a line.
 _AROUND = " \t\r\n,;'\""
 #: Places that differ by less than this are of one flight in degrees, and one place in metres.
@@ -55,7 +57,9 @@ class UnknownSystem(CaptureError):
 def names_a_system(line: str) -> bool:
     """Whether a line is the name of a coordinate system, as far as its beginning tells, or PROJ knows the whole."""
     line = line.strip(_AROUND)
-    return bool(_STARTS.match(line)) or (bool(_WORDS.fullmatch(line)) and _is_name(line))
+    if _STARTS.match(line):
+        return True
+    return bool(_WORDS.fullmatch(line)) and not _FILE_NAME.search(line) and _is_name(line)
 
 
 @cache
