@@ -14,9 +14,10 @@ from vdgs.config.presets import PRESETS
 from vdgs.config.serialization import diff_settings, from_dict, to_dict
 from vdgs.config.validation_rules import validate_config
 from vdgs.errors import RunError
+from vdgs.runs.config_file import load_yaml
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.runs.stage_keys import REQUIRED_SETTINGS, hashable_settings, stage_keys
 from vdgs.system.atomic_files import write_json, write_text
@@ -63,6 +64,21 @@ def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(RunError, match=r"config\.yaml"):
         RunFolder(tmp_path).settings()
+
+
+def test_a_config_that_was_cut_off_is_not_filled_up_with_defaults(tmp_path):
+    run = RunFolder(tmp_path)
+    run.create_or_check(settings())
+    text = run.config_file.read_text()
+    for section in SECTIONS[1:]:
+        run.config_file.write_text(text[: text.index(f"\n{section}:\n") + 1])
+        with pytest.raises(RunError, match=f"damaged .*no `{section}`"):
+            run.settings()
+
+
+def test_numbers_of_settings_are_decimal():
+    text = "{a: 010, b: 1:30, c: 12, d: 0x10, e: -3, f: 1:30.5}"
+    assert load_yaml(text) == {"a": "010", "b": "1:30", "c": 12, "d": 16, "e": -3, "f": "1:30.5"}
 
 
 @pytest.mark.parametrize(

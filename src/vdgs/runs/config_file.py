@@ -116,8 +116,12 @@ def _parse_settings(path: Path, text: str) -> RunSettings:
         settings = load_yaml(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise RunError(f"{path}: is damaged, not valid YAML ({error})") from error
-    if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
-        raise RunError(f"{path}: is damaged or not of a vdgs run (no `capture` and `training`)")
+    missing = [name for name in SECTIONS if not isinstance(settings, dict) or name not in settings]
+    if missing:  # a part of a file may be YAML too: defaults in place of the rest would train another scene
+        raise RunError(
+            f"{path}: is damaged or not of a vdgs run (no `{missing[0]}`). Put a whole copy there, or start a new "
+            "--output."
+        )
     settings.pop("vdgs", None)
     try:
         return RunSettings.from_dict(settings)
@@ -162,10 +166,15 @@ class _Loader(yaml.SafeLoader):
     def construct_yaml_float(self, node: yaml.ScalarNode) -> Any:
         """A number, but 30.000 as it is written: where a whole number is asked for, it is thirty thousand to many."""
         number = super().construct_yaml_float(node)
-        return node.value if re.fullmatch(r"[+-]?\d+\.\d{3}", node.value) else number
+        return node.value if ":" in node.value or re.fullmatch(r"[+-]?\d+\.\d{3}", node.value) else number
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> Any:
+        """A number, but 010 and 1:30 as they are written: YAML takes them for 8 and 90."""
+        return node.value if re.match(r"[+-]?0\d|.*:", node.value) else super().construct_yaml_int(node)
 
 
 _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def load_yaml(text: str) -> Any:
