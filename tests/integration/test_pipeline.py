@@ -165,6 +165,18 @@ def test_a_finished_run_does_nothing_again(capture, copied):
     assert changed_files(copied, before) <= {"report.html", ".run/progress.json"}
 
 
+def test_models_that_were_cut_off_are_made_again_with_the_same_bits(capture, copied):
+    models = {copied / stage / "model.safetensors" for stage in ("coarse", "blocks/00", "merged")}
+    before = {file: file.read_bytes() for file in models}
+    for file, content in before.items():
+        file.write_bytes(content[: len(content) * 2 // 3])
+    assert vdgs("status", copied).returncode != 0
+    again = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert again.returncode == 0, again.stderr
+    assert {file: file.read_bytes() for file in models} == before
+    assert vdgs("status", copied).returncode == 0
+
+
 def test_other_settings_are_refused_where_they_cost_training(capture, copied):
     before = moments(copied)
     refused = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0")

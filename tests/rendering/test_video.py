@@ -57,6 +57,12 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["good.mp4"]
 
 
+def test_a_folder_that_takes_no_files_is_said_before_frames_are_drawn(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(VdgsError, match=r"file: cannot be written \(Not a directory\)\. Move away"):
+        VideoWriter(tmp_path / "file" / "film.mp4", 30).__enter__()
+
+
 def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("vdgs.rendering.video.importlib.util.find_spec", lambda name: None)
     monkeypatch.setattr("vdgs.rendering.video._ffmpeg_on_path", lambda: None)

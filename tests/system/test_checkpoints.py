@@ -83,7 +83,7 @@ def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))  # writes beyond fail, as on a full disk
     try:
-        with pytest.raises(VdgsError, match=r"00000002\.safetensors: cannot be written.*continues"):
+        with pytest.raises(VdgsError, match=r"00000002\.safetensors: cannot be written.*is kept"):
             save_checkpoint(tmp_path, state(2))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -53,7 +53,7 @@ from vdgs.runs.run_folder import REPORT_FILE
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.console import make_progress_bar
 from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
-from vdgs.system.scratch import remove_leftovers
+from vdgs.system.scratch import check_takes_files, remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.visibility.visibility_counts import count_visibility
 
@@ -169,6 +169,8 @@ def write_files(
         check_not_among_inputs(request.background, run.capture)
     center = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
+    for path in request.output:
+        check_takes_files(path.parent)
     _tidy(request.output, console)
     began = time.monotonic()
     whole, run = run, with_faded_edge(run, request)

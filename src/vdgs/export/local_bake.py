@@ -53,10 +53,10 @@ class LocalBake:
     @contextmanager
     def spool(self, kept: Int[np.ndarray, " m"]) -> Iterator[GaussianStore]:
         """These Gaussians in a temporary file beside the first output; `pixels` was asked before."""
-        folder = self._asked.output[0].parent
-        with scratch_folder(folder / BAKING) as temporary:
+        output = self._asked.output[0]
+        with scratch_folder(output.parent / BAKING) as temporary:
             with make_progress_bar(self._console) as bar:
-                with explain_disk_errors(temporary / "spool"):
+                with explain_disk_errors(output):
                     spool = self._fitted(kept, temporary / "spool", bar)
                 self._improve(BakedGaussians(self._run.model, kept, spool), bar)
             yield spool

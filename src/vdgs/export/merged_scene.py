@@ -67,7 +67,7 @@ def merged_scene(
     """A baked scene as `max_count` Gaussians in a temporary file beside a path. `weights`: how many pixels each makes.
     `after_part` is told how many are done."""
     chunks = merged_blocks(baked.spool, weights, max_count, after_part)
-    with scratch_folder(beside) as folder, explain_disk_errors(folder / "merged"):
+    with scratch_folder(beside) as folder, explain_disk_errors(beside.parent):
         scene = ExportScene(chunks=chunks, count=max_count, degree=baked.spool.degree)
         yield MergedGaussians(baked, write_store(scene, folder / "merged"))
 

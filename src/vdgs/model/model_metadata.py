@@ -63,3 +63,15 @@ def read_model_metadata(path: Path) -> ModelMetadata:
         header = json.loads(file.read(size))["__metadata__"]
     content = json.loads(header.get(ANCHOR_MODEL_FORMAT) or header[MULTI_DECODER_FORMAT])
     return ModelMetadata.from_dict(content["facts"])
+
+
+def is_cut_off(path: Path) -> bool:
+    """Whether a safetensors file is shorter than its header says, or has no header that can be read."""
+    try:
+        with path.open("rb") as file:
+            size = int.from_bytes(file.read(8), "little")
+            header = json.loads(file.read(min(size, path.stat().st_size)))
+        ends = [entry["data_offsets"][1] for name, entry in header.items() if name != "__metadata__"]
+        return path.stat().st_size < 8 + size + max(ends, default=0)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+        return True

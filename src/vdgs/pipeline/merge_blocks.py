@@ -30,9 +30,9 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
     with run.locked():
         keys, blocks = run.keys(), load_run_blocks(run)
         folders = [run.block(index) for index in range(len(blocks))]
-        done = [folder.is_done(keys.blocks) for folder in folders]
+        done = [folder.needs_no_work(keys.blocks) for folder in folders]
         models = [folder.status().model_id if is_done else None for folder, is_done in zip(folders, done, strict=True)]
-        if run.merged.is_done(keys.merge) and run.merged.status().block_models == tuple(models):
+        if run.merged.needs_no_work(keys.merge) and run.merged.status().block_models == tuple(models):
             console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
             return
         if not all(done) and not allow_missing_blocks:

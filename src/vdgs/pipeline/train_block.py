@@ -65,7 +65,7 @@ def train_block(
             raise RunError(f"{run.path}: has blocks 0 to {len(blocks) - 1}; there is no block {index}")
         folder, key = run.block(index), run.keys().blocks
         with folder.locked():
-            if folder.is_done(key):
+            if folder.needs_no_work(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
             folder.reset_unless(key)

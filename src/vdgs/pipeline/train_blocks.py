@@ -48,7 +48,7 @@ def train_blocks(
     with run.locked(shared=True):
         blocks, key = load_run_blocks(run), run.keys().blocks
         _remove_beyond(run, len(blocks), console)
-        pending = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
+        pending = [index for index in range(len(blocks)) if not run.block(index).needs_no_work(key)]
         if not pending:
             console.print(f"{context.run.path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
@@ -89,7 +89,7 @@ def _mark_queued(folder: StageFolder, key: str) -> None:
     """Set the status of a block to queued, and delete work of other settings; not if another process trains it."""
     with suppress(RunError), folder.locked():
         folder.reset_unless(key)
-        if not folder.is_done(key):
+        if not folder.needs_no_work(key):
             folder.set_status(StatusRecord(state="queued"))
 
 

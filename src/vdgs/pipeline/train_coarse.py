@@ -59,7 +59,7 @@ def train_coarse(context: RunContext, options: CheckpointOptions, console: Conso
     options.check()
     run = context.run
     folder, key = run.coarse, run.keys().coarse
-    if folder.is_done(key):  # its blocks may be at work
+    if folder.needs_no_work(key):  # its blocks may be at work
         check_has_anchors(run, folder.status().anchors)
         console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
         return

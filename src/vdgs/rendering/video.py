@@ -29,7 +29,7 @@ from jaxtyping import UInt8
 
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import is_disk_full
-from vdgs.system.scratch import remove_leftovers
+from vdgs.system.scratch import check_takes_files, remove_leftovers
 
 Encoder = Literal["ffmpeg", "av", "vp9", "mpeg4"]
 #: What a person should know of a film by its encoder.
@@ -226,6 +226,7 @@ class VideoWriter:
         self._pen: _Pen | None = None
 
     def __enter__(self) -> VideoWriter:
+        check_takes_files(self.path.parent)
         return self
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:

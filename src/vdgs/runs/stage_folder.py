@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import RunError
+from vdgs.model.model_metadata import is_cut_off
 from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.system.atomic_files import read_json, write_json, write_text
 from vdgs.system.file_locks import lock_folder
@@ -122,6 +123,10 @@ class StageFolder:
     def is_done(self, key: str | None = None) -> bool:
         """Trained to the end, for the settings of `key` where one is given."""
         return self.status().state == "done" and self.model.exists() and key in (None, self.key())
+
+    def needs_no_work(self, key: str) -> bool:
+        """Trained to the end for the settings of `key`, and the file of the model was not cut off afterwards."""
+        return self.is_done(key) and not is_cut_off(self.model)
 
     @contextmanager
     def locked(self) -> Iterator[None]:

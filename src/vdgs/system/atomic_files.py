@@ -50,7 +50,7 @@ def explain_disk_errors(path: Path) -> Iterator[None]:
         why = reason_of(error, path.parent)
         raise VdgsError(
             f"{path}: cannot be written ({getattr(why, 'strerror', None) or why}). {disk_hint(why)}, then run the same "
-            "command again: it continues from the last good state."
+            "command again: what was finished is kept."
         ) from error
 
 

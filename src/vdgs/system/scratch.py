@@ -18,6 +18,8 @@ from pathlib import Path
 
 import psutil
 
+from vdgs.system.atomic_files import explain_disk_errors
+
 #: How the names of scratch folders end, and their file that is locked.
 ENDING, LOCK = ".scratch", ".lock"
 #: Temporary files of `write_atomically` and of films.
@@ -29,8 +31,9 @@ _YOUNG_SECONDS = 60.0
 @contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
     """A folder beside `path` for what waits while it is written; it goes when the context ends."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=ENDING))
+    with explain_disk_errors(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=ENDING))
     try:
         with (folder / LOCK).open("a+b") as handle:
             with suppress(OSError):  # a file system without locks: what is left there stays
@@ -38,6 +41,13 @@ def scratch_folder(path: Path) -> Iterator[Path]:
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def check_takes_files(folder: Path) -> None:
+    """Raise VdgsError, before long work, where no file can be made in a folder that is there or will be created."""
+    there = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    with explain_disk_errors(folder), tempfile.TemporaryFile(dir=there):
+        pass
 
 
 def leftovers(path: Path) -> list[Path]:

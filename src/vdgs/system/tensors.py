@@ -26,7 +26,7 @@ DTYPES = {
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
 _CHUNK = 1 << 20
 #: What to do about a model that cannot be used.
-REBUILD_HINT = "Delete it and run the command that trained it again: it is rebuilt from the last checkpoint."
+REBUILD_HINT = "Delete it and run `vdgs run`, or the verb that made it, again: it is rebuilt."
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
