@@ -262,6 +262,17 @@ def test_a_lens_of_meshroom_that_is_not_read_is_named(tmp_path: Path, flight: Kn
         read(tmp_path, "alicevision")
 
 
+@pytest.mark.parametrize("program", ["pix4d", "opf"])
+def test_heights_of_pix4d_have_the_unit_of_its_system(tmp_path: Path, flight: KnownFlight, program: str) -> None:
+    """The system has no heights; x, y and z of a camera model have one unit."""
+    flight.write_photographs(tmp_path / "images")
+    getattr(writers, f"write_{program}")(tmp_path, flight, unit=1200 / 3937)
+    source = read(tmp_path, program)
+    check_numbers(source, flight)
+    assert source.georef is not None
+    assert "x, y and heights in feet" in source.georef.method
+
+
 def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, flight: KnownFlight) -> None:
     file = writers.write_pix4d(tmp_path / "flight", flight)
     flight.write_photographs(tmp_path / "images")

@@ -224,21 +224,12 @@ def _system(items: _Items) -> tuple[ToGeodetic | None, str, bool]:
     if (scale <= 0).any():
         raise CaptureError(f"{file}: 'scale' must be positive. {_AGAIN}")
     geoid = parse_number(crs, "geoid_height", file) or 0.0
-    known, name = to_geodetic(definition, file, "'definition'")
-    meters = np.array([1.0, 1.0, _height_unit(definition)])
+    known, name = to_geodetic(definition, file, "'definition'", heights_as_xy=True)
     order = [1, 0, 2] if change.get("swap_xy") else [0, 1, 2]
 
     def to_earth(points: np.ndarray) -> np.ndarray:
         base = (points - shift)[:, order] / scale
         # The system is told with its own axes; what is asked has x to the east.
-        return known(base[:, order] * meters) + np.array([0.0, 0.0, geoid])
+        return known(base[:, order]) + np.array([0.0, 0.0, geoid])
 
     return to_earth, f"OPF, {name}", False
-
-
-def _height_unit(definition: str) -> float:
-    """Metres in the unit of heights, of systems that have none: there they are in the unit of the others."""
-    import pyproj
-
-    crs = pyproj.CRS.from_user_input(definition)
-    return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0
