@@ -237,6 +237,39 @@ def test_meshroom_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, ve
     check_tie_points(read(tmp_path, "alicevision"), flight)
 
 
+def test_photographs_of_a_rig_of_meshroom_have_its_pose_and_then_their_cameras(
+    tmp_path: Path, flight: KnownFlight
+) -> None:
+    """Pairs of photographs share a pose; of the last pair the second camera's place in the rig is not known, and of the
+    first both are independent."""
+    from scipy.spatial.transform import Rotation
+
+    inside = np.eye(4)
+    inside[:3, :3] = Rotation.from_euler("yx", (20, 5), degrees=True).as_matrix()
+    inside[:3, 3] = -inside[:3, :3] @ (0.3, 0.05, -0.1)
+    poses = flight.poses.copy()
+    poses[3::2] = inside @ poses[2::2]
+    flight = replace(flight, poses=poses)
+    file = writers.write_alicevision(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    content = json.loads(file.read_text())
+    for index, view in enumerate(content["views"]):
+        view.update(rigId="5", subPoseId=str(index % 2), isPoseIndependant="1" if index < 2 else "0")
+        view["poseId"] = str(index if index < 2 else index // 2 * 2)
+    content["views"][-1]["subPoseId"] = "2"
+    for view in content["views"][:1]:
+        del view["isPoseIndependant"]
+    content["rigs"] = [{"rigId": "5", "subPoses": [
+        {"status": status, "pose": {"rotation": [str(each) for each in pose[:3, :3].T.ravel()],
+                                    "center": [str(each) for each in -pose[:3, :3].T @ pose[:3, 3]]}}
+        for status, pose in (("constant", np.eye(4)), ("estimated", inside), ("uninitialized", np.eye(4)))
+    ]}]  # fmt: skip
+    file.write_text(json.dumps(content))
+    source = read(tmp_path, "alicevision")
+    assert any("1 photographs" in note and flight.names[-1] in note for note in source.warnings)
+    check_tie_points(source, replace(flight, names=flight.names[:-1], poses=poses[:-1]))
+
+
 @pytest.mark.parametrize(
     ("lens", "told"),
     [

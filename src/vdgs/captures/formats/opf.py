@@ -7,6 +7,7 @@ left-handed, and shifted.
 
 from __future__ import annotations
 
+from itertools import compress
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -15,6 +16,7 @@ import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_local_system, to_geodetic
 from vdgs.captures.formats.brown_lens import MAX_POWERS, brown_intrinsics, quarter_turn_fisheye
+from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.gltf_points import GltfPoints, join_points, read_gltf_points
 from vdgs.captures.formats.json_poses import (
     OPENGL_FROM_OPENCV,
@@ -57,19 +59,26 @@ def read(file: Path, options: CaptureOptions) -> Project:
         for each in _dicts(read_capture_json(list_file), "cameras", list_file)
     }
     where, cloud = items.path("calibrated-cameras") or file, _points(items)
-    views, refused, warnings, used = list[ProjectView](), dict[str, list[str]](), list[str](), set[int]()
-    for camera in _dicts(calibrated, "cameras", where):
-        number, sensor = _number(camera, "id", where), _number(camera, "sensor_id", where)
-        name = photograph_name(uris.get(number, f"camera {number}"))
+    views, refused = list[ProjectView](), dict[str, list[str]]()
+    listed = [
+        (camera, _number(camera, "id", where), _number(camera, "sensor_id", where))
+        for camera in _dicts(calibrated, "cameras", where)
+    ]
+    names, bands = {number: photograph_name(uri) for number, uri in uris.items()}, _bands(items)
+    in_color, warnings = color_cameras(
+        [(names.get(number, f"camera {number}"), bands.get(sensor, ())) for _, number, sensor in listed]
+    )
+    for camera, number, sensor in compress(listed, in_color):
+        name = names.get(number, f"camera {number}")
         lens = sensors.get(sensor, f"its sensor {sensor} is not calibrated")
-        used.add(number)
         if isinstance(lens, str):
             refused.setdefault(lens, []).append(name)
             continue
         pose = _pose(camera, where, f"camera {number}")
         seen = cloud.shown.get(number)
         views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=seen))
-    warnings += name_unaligned([photograph_name(uri) for number, uri in uris.items() if number not in used])
+    calibrated_ids = {number for _, number, _ in listed}
+    warnings += name_unaligned([name for number, name in names.items() if number not in calibrated_ids])
     rolling = sum(_rolls(camera.get("rolling_shutter")) for camera in calibrated["cameras"])
     if rolling:
         warnings.append(f"the rolling shutter of {rolling} photographs is not modelled.")
@@ -161,6 +170,18 @@ def _sensors(items: _Items, calibrated: JsonObject, file: Path) -> dict[int, Int
         else:
             found[number] = _perspective(inside, sizes[number], file, f"sensor {number}")
     return found
+
+
+def _bands(items: _Items) -> dict[int, tuple[str, ...]]:
+    """The names of the bands that sensors show, by the numbers of the sensors, where the project says them."""
+    file = items.path("input-cameras")
+    sensors = _dicts(read_capture_json(file), "sensors", file) if file is not None else []
+    listed = {_number(each, "id", file or items.file): each.get("bands") for each in sensors}
+    return {
+        number: tuple(str(band.get("name", "")) for band in bands if isinstance(band, dict))
+        for number, bands in listed.items()
+        if isinstance(bands, list)
+    }
 
 
 def _perspective(inside: JsonObject, size: np.ndarray, file: Path, label: str) -> Intrinsics:
