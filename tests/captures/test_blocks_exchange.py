@@ -119,7 +119,6 @@ def test_thermal_photogroups_are_named_and_left_out(tmp_path, flight):
     start, end = whole.index("<Photogroup>"), whole.index("</Photogroups>")
     group = whole[start:end].replace("<Name>", "<CameraModelBand>Thermal</CameraModelBand><Name>", 1)
     thermal = group.replace("\\flights\\", "\\thermal\\").replace("<Id>", "<Id>9")
-    flight.touch(tmp_path / "thermal")
     source = read(tmp_path, blocks_xml(flight, None, more=thermal), flight)
     assert len(source.views) == len(flight.names)
     assert any("6 cameras show other bands (Thermal) than the rest" in each for each in source.warnings)

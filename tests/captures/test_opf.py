@@ -89,7 +89,7 @@ def test_cameras_of_opf_of_other_bands_are_named_and_left_out(tmp_path, flight, 
     sensors.write_text(json.dumps(content))
     calibrated.write_text(json.dumps(cameras))
     source = read(tmp_path, "opf")
-    assert [view.name for view in source.views] == [f"{name}" for name in flight.names[:used]]
+    assert [view.name for view in source.views] == flight.names[:used]
     assert [note.startswith(said) for note in source.warnings] == ([True] if said else [])
 
 
