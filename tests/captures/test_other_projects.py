@@ -222,6 +222,10 @@ def test_shrunk_photographs_are_told_by_the_pixels_of_a_file_without_sizes(tmp_p
 def test_openmvg_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, nested: bool) -> None:
     file = writers.write_openmvg(tmp_path, flight, nested=nested)
     flight.write_photographs(tmp_path / "images")
+    listing = json.loads((tmp_path / "sfm_data.json").read_text())
+    for view, center in zip(listing["views"], flight.centers.tolist(), strict=True):  # as SfMInit_ImageListing -P does
+        view["value"]["ptr_wrapper"]["data"] |= {"use_pose_center_prior": True, "center": center}
+    (tmp_path / "sfm_data.json").write_text(json.dumps(listing, indent=4))
     check_tie_points(read(tmp_path, "openmvg"), replace(flight, colors=np.full_like(flight.colors, 128)))
     file.unlink()
     with pytest.raises(CaptureError, match="not a capture"):

@@ -7,6 +7,7 @@ millimetres of the sensor, and in files before version 1.2.2 in pixels. The worl
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
@@ -19,13 +20,14 @@ from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.formats.xml_documents import files_ending, holds
+from vdgs.captures.formats.xml_documents import files_ending, holds, holds_match
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
 _OPENMVG = b'"sfm_data_version"'
+_OPENMVG_POSES = re.compile(rb'"extrinsics"\s*:\s*\[\s*\{')
 _AGAIN = "Export it again."
 #: AliceVision's kinds of lenses, as its versions call them, by the terms of `_lens`.
 _ALICEVISION = {
@@ -48,8 +50,8 @@ def is_alicevision(file: Path) -> bool:
 
 
 def find_openmvg(root: Path) -> list[Path]:
-    """The files of a folder that have poses; the one that lists the photographs has none."""
-    return [file for file in files_ending(root, ".json") if is_openmvg(file) and holds(file, b'"center"')]
+    """The files of a folder that have poses; the one that lists the photographs has none, though places by GPS."""
+    return [file for file in files_ending(root, ".json") if is_openmvg(file) and holds_match(file, _OPENMVG_POSES)]
 
 
 def find_alicevision(root: Path) -> list[Path]:
