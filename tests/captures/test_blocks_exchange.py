@@ -114,6 +114,19 @@ def test_groups_whose_poses_or_lens_are_left_to_the_program_are_not_taken_for_al
     assert len(names) == len(flight.names)
 
 
+def test_thermal_photogroups_are_named_and_left_out(tmp_path, flight):
+    whole = blocks_xml(flight, None)
+    start, end = whole.index("<Photogroup>"), whole.index("</Photogroups>")
+    group = whole[start:end].replace("<Name>", "<CameraModelBand>Thermal</CameraModelBand><Name>", 1)
+    thermal = group.replace("\\flights\\", "\\thermal\\").replace("<Id>", "<Id>9")
+    source = read(tmp_path, blocks_xml(flight, None, more=thermal), flight)
+    assert len(source.views) == len(flight.names)
+    assert any("6 cameras show other bands (Thermal) than the rest" in each for each in source.warnings)
+    alone = read(tmp_path, whole[:start] + group + whole[end:], flight)
+    assert_true(alone, flight)
+    assert not any("bands" in each for each in alone.warnings)
+
+
 def test_photographs_without_pose_are_named_and_left_out(tmp_path, flight):
     more = (
         "<Photogroup><Name>late</Name><Photo><Id>90</Id><ImagePath>late_1.JPG</ImagePath></Photo><Photo><Id>91</Id>"

@@ -17,6 +17,7 @@ from support.dataset_layouts import DRB, OPENGL, halves, write_blender, write_ma
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
 from vdgs.captures.loading import load_capture
+from vdgs.captures.nested_captures import foreign_poses
 from vdgs.captures.output_guard import is_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -128,6 +129,11 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
         "scene.mvs",
         "sensors/trajectories.txt",
         "keyframes/corrected_cameras/1.json",
+        "cameras.npz",
+        "dataparser_transforms.json",
+        "synth_0.out",
+        "flight.ori",
+        "itera.dat",
     ],
 )
 def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
@@ -152,6 +158,12 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ),
         ("block.xml", '<?xml version="1.0"?><BlocksExchange version="3.2"><Block/></BlocksExchange>', "without poses"),
         ("metadata.json", '{"w": 720, "h": 960, "initPose": [0, 0, 0, 1, 0, 0, 0]}', "poses of Record3D"),
+        ("metadata.json", '{"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0', "poses of Record3D"),
+        ("metadata.json", '{"h": 960, "perFrameIntrinsicCoeffs": [[0, 0, 0, 1]', "poses of Record3D"),
+        ("cameras/17.json", '{"t_00": 1.0, "t_01": 0.0, "t_02": 0.0, "fx": 900}', "poses of Polycam"),
+        ("cams/00000000_cam.txt", "extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\nintrinsic\n", "of MVSNet"),
+        ("Barn.log", "0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 -2.5e-1\n0 0 0 1\n", "of Tanks and Temples"),
+        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n1.0, 000000, 0, 0", "Stray Scanner; the film"),
         ("cameras.json", '[{"id": 0, "img_name": "a", "position": [0, 0, 1], "fx": 900}]', "of a trained 3DGS scene"),
         ("meta_data.json", '{"camera_model": "OPENCV", "has_mono_prior": true, "frames": []}', "poses of SDFStudio"),
         ("sfm_data.json", '{"sfm_data_version": "0.3", "views": [], "extrinsics": []}', "OpenMVG without poses"),
@@ -173,6 +185,32 @@ def test_files_that_only_their_beginning_tells_are_said(tmp_path, name, text, sa
     (tmp_path / name).write_text(text)
     with pytest.raises(CaptureError, match=rf"not a capture. Not read: .*{Path(name).name}: .*{says}"):
         load_capture(tmp_path)
+
+
+def test_a_kind_of_files_is_named_once(tmp_path):
+    write_images(tmp_path, tiny_scene(width=160, height=120))
+    for number in range(3):
+        (tmp_path / f"{number}.json").write_text('{"t_00": 1.0, "t_01": 0.0, "t_02": 0.0, "fx": 900}')
+    (tmp_path / "run.log").write_text("12 photographs of 3 flights\n 1 2 3\n")
+    assert [note.partition(":")[0] for note in foreign_poses(tmp_path)] == ["0.json"]
+
+
+@pytest.mark.parametrize("name", ["zz", "aa"])
+def test_a_capture_below_comes_before_a_model_without_photographs(tmp_path, scene, name):
+    write_colmap(tmp_path / "calibration" / "middle", scene, images=None)
+    write_colmap(tmp_path / "calibration" / name, scene)
+    with pytest.raises(CaptureError, match=f"calibration/{name} is a capture: vdgs run"):
+        load_capture(tmp_path)
+
+
+def test_a_capture_below_whose_photographs_lie_beside_it_is_named_with_them(tmp_path, scene):
+    write_transforms(tmp_path / "nerf", scene)
+    (tmp_path / "nerf" / "images").rename(tmp_path / "photographs")
+    with pytest.raises(CaptureError, match="nerf is a capture") as refused:
+        load_capture(tmp_path)
+    command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", str(refused.value))
+    assert command is not None
+    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
 
 
 def test_registered_cameras_of_realityscan_are_told_from_tables(tmp_path):

@@ -276,8 +276,56 @@ def test_test_lists_and_every_nth(folder, scene, tmp_path):
     every = load_capture(folder, up(test_list=listed, split="every", test_every=3))
     assert [view.name for view in every.test_views] == sorted(scene.cameras)[::3]
     listed.write_text("nobody.png\n")
-    with pytest.raises(CaptureError, match=r"1 of its names are not photographs(?s:.)*nobody\.png"):
+    with pytest.raises(CaptureError, match=r"1 of its 1 names .* such as frame_000\.png(?s:.)*\n  nobody\.png"):
         load_capture(folder, up(test_list=listed))
+
+
+def test_a_list_may_name_photographs_without_a_camera_and_those_that_are_gone(folder, scene):
+    """As benchmarks do: the whole list is of a set that COLMAP did not register whole."""
+    names = sorted(scene.cameras)
+    (folder / "images" / names[5]).unlink()
+    (folder / "test.txt").write_text("\n".join([names[2], names[5], "unregistered.png"]))
+    (folder / "validation.txt").write_text(f"{names[7]}\nunregistered.png\n")
+    capture = load_capture(folder, UP)
+    assert [view.name for view in capture.test_views] == [names[2]]
+    assert names[7] not in {view.name for view in capture.views}
+    test, validation = (note for note in capture.warnings if "that has a camera and is there" in note)
+    assert "test.txt: 2 of its 3 names are of no photograph" in test
+    assert test.endswith(f"({names[5]}, unregistered.png).")
+    assert "validation.txt: 1 of its 2 names" in validation
+    write_images(folder / "images", scene)
+    with pytest.raises(CaptureError, match=r"test\.txt: 1 of its 3 names .*\n  unregistered\.png"):
+        load_capture(folder, up(strict=True))
+
+
+@pytest.mark.parametrize("line", ["{1}", "{0}\\{1}", "images/{0}/{1}", "./{0}/{1}", "D:\\card\\{0}\\{1}"])
+def test_lists_name_photographs_in_all_ways_that_mean_one(tmp_path, scene, line):
+    cards = {f"{100 + k // 6}MEDIA/{name}": camera for k, (name, camera) in enumerate(scene.cameras.items())}
+    write_colmap(tmp_path, TinyScene(cards, scene.points, scene.colors))
+    chosen = [sorted(cards)[k] for k in (2, 9)]
+    (tmp_path / "test.txt").write_text("\r\n".join(line.format(*name.split("/")) for name in chosen))
+    assert [view.name for view in load_capture(tmp_path, UP).test_views] == chosen
+
+
+def test_a_line_of_a_list_that_may_mean_several_photographs_is_refused(tmp_path, scene):
+    cards = {f"{100 + k % 6}MEDIA/{k // 6}.png": camera for k, camera in enumerate(scene.cameras.values())}
+    write_colmap(tmp_path, TinyScene(cards, scene.points, scene.colors))
+    (tmp_path / "test.txt").write_text("100MEDIA/1.png\n1.png\n")
+    with pytest.raises(CaptureError, match=r"'1\.png' may be 10\dMEDIA/1\.png or .*: write the folder too"):
+        load_capture(tmp_path, UP)
+
+
+@pytest.mark.parametrize("sparse", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_lists_beside_the_model_are_read(tmp_path, scene, sparse):
+    """3DGS and its hierarchical version have test.txt there."""
+    names, model = sorted(scene.cameras), write_colmap(tmp_path, scene, sparse=sparse)
+    (model / "test.txt").write_text(f"{names[3]}\n{names[7]}\n")
+    (model / "validation.txt").write_text(names[5])
+    capture = load_capture(tmp_path, UP)
+    assert [view.name for view in capture.test_views] == [names[3], names[7]]
+    assert names[5] not in {view.name for view in capture.views}
+    (tmp_path / "test.txt").write_text(names[4])
+    assert [view.name for view in load_capture(tmp_path, UP).test_views] == [names[4]]
 
 
 def test_a_capture_may_bring_its_own_lists(folder, scene):

@@ -64,6 +64,35 @@ def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) 
         read(tmp_path, "opf")
 
 
+@pytest.mark.parametrize(
+    ("bands", "used", "said"),
+    [
+        ((["Red", "Green", "Blue"], ["LWIR"]), 8, "4 cameras show other bands (LWIR) than the rest"),
+        ((None, ["Red edge"]), 8, "4 cameras show other bands (Red edge)"),
+        ((["NIR"], ["Red"]), 8, "4 cameras show other bands (Red)"),
+        ((["LWIR"], ["LWIR"]), 12, ""),
+    ],
+)
+def test_cameras_of_opf_of_other_bands_are_named_and_left_out(tmp_path, flight, bands, used, said):
+    """Eight photographs of one sensor, four of another, whose lens is none that is read."""
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    sensors, calibrated = tmp_path / "input-cameras.json", tmp_path / "calibrated-cameras.json"
+    content, cameras = json.loads(sensors.read_text()), json.loads(calibrated.read_text())
+    for number, shown in zip((77, 88), bands, strict=True):
+        named = {} if shown is None else {"bands": [{"name": name, "weight": 1.0} for name in shown]}
+        content["sensors"].append({**content["sensors"][0], "id": number, **named})
+    internals = cameras["sensors"][0]["internals"]
+    cameras["sensors"].append({"id": 88, "internals": {**internals, "type": "spherical" if said else "perspective"}})
+    for camera in cameras["cameras"][8:]:
+        camera["sensor_id"] = 88
+    sensors.write_text(json.dumps(content))
+    calibrated.write_text(json.dumps(cameras))
+    source = read(tmp_path, "opf")
+    assert [view.name for view in source.views] == flight.names[:used]
+    assert [note.startswith(said) for note in source.warnings] == ([True] if said else [])
+
+
 def test_opf_of_a_site_is_metres_without_a_place(tmp_path: Path, flight: KnownFlight) -> None:
     writers.write_opf(tmp_path, flight)
     flight.write_photographs(tmp_path / "images")

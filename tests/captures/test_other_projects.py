@@ -222,6 +222,10 @@ def test_shrunk_photographs_are_told_by_the_pixels_of_a_file_without_sizes(tmp_p
 def test_openmvg_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, nested: bool) -> None:
     file = writers.write_openmvg(tmp_path, flight, nested=nested)
     flight.write_photographs(tmp_path / "images")
+    listing = json.loads((tmp_path / "sfm_data.json").read_text())
+    for view, center in zip(listing["views"], flight.centers.tolist(), strict=True):  # as SfMInit_ImageListing -P does
+        view["value"]["ptr_wrapper"]["data"] |= {"use_pose_center_prior": True, "center": center}
+    (tmp_path / "sfm_data.json").write_text(json.dumps(listing, indent=4))
     check_tie_points(read(tmp_path, "openmvg"), replace(flight, colors=np.full_like(flight.colors, 128)))
     file.unlink()
     with pytest.raises(CaptureError, match="not a capture"):
@@ -235,6 +239,39 @@ def test_meshroom_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, ve
     writers.write_alicevision(tmp_path, flight, version)
     flight.write_photographs(tmp_path / "images")
     check_tie_points(read(tmp_path, "alicevision"), flight)
+
+
+def test_photographs_of_a_rig_of_meshroom_have_its_pose_and_then_their_cameras(
+    tmp_path: Path, flight: KnownFlight
+) -> None:
+    """Pairs of photographs share a pose; of the last pair the second camera's place in the rig is not known, and of the
+    first both are independent."""
+    from scipy.spatial.transform import Rotation
+
+    inside = np.eye(4)
+    inside[:3, :3] = Rotation.from_euler("yx", (20, 5), degrees=True).as_matrix()
+    inside[:3, 3] = -inside[:3, :3] @ (0.3, 0.05, -0.1)
+    poses = flight.poses.copy()
+    poses[3::2] = inside @ poses[2::2]
+    flight = replace(flight, poses=poses)
+    file = writers.write_alicevision(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    content = json.loads(file.read_text())
+    for index, view in enumerate(content["views"]):
+        view.update(rigId="5", subPoseId=str(index % 2), isPoseIndependant="1" if index < 2 else "0")
+        view["poseId"] = str(index if index < 2 else index // 2 * 2)
+    content["views"][-1]["subPoseId"] = "2"
+    for view in content["views"][:1]:
+        del view["isPoseIndependant"]
+    content["rigs"] = [{"rigId": "5", "subPoses": [
+        {"status": status, "pose": {"rotation": [str(each) for each in pose[:3, :3].T.ravel()],
+                                    "center": [str(each) for each in -pose[:3, :3].T @ pose[:3, 3]]}}
+        for status, pose in (("constant", np.eye(4)), ("estimated", inside), ("uninitialized", np.eye(4)))
+    ]}]  # fmt: skip
+    file.write_text(json.dumps(content))
+    source = read(tmp_path, "alicevision")
+    assert any("1 photographs" in note and flight.names[-1] in note for note in source.warnings)
+    check_tie_points(source, replace(flight, names=flight.names[:-1], poses=poses[:-1]))
 
 
 @pytest.mark.parametrize(
@@ -260,6 +297,17 @@ def test_a_lens_of_meshroom_that_is_not_read_is_named(tmp_path: Path, flight: Kn
     file.write_text(file.read_text().replace('"brown"', '"3deanamorphic4"'))
     with pytest.raises(CaptureError, match="lens 7 is '3deanamorphic4'; read are pinhole"):
         read(tmp_path, "alicevision")
+
+
+@pytest.mark.parametrize("program", ["pix4d", "opf"])
+def test_heights_of_pix4d_have_the_unit_of_its_system(tmp_path: Path, flight: KnownFlight, program: str) -> None:
+    """The system has no heights; x, y and z of a camera model have one unit."""
+    flight.write_photographs(tmp_path / "images")
+    getattr(writers, f"write_{program}")(tmp_path, flight, unit=1200 / 3937)
+    source = read(tmp_path, program)
+    check_numbers(source, flight)
+    assert source.georef is not None
+    assert "x, y and heights in feet" in source.georef.method
 
 
 def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, flight: KnownFlight) -> None:

@@ -152,9 +152,51 @@ def test_a_side_without_a_list_takes_the_frames_that_the_other_leaves(tmp_path, 
 
 def test_lists_of_what_is_no_frame_are_refused(tmp_path, scene):
     write_transforms(tmp_path, scene, train_filenames=["images/frame_000.JPG"], test_filenames=["images/else.png"])
-    with pytest.raises(CaptureError, match=r"1 names in its lists .*--split every\.\n  images/else\.png"):
+    with pytest.raises(CaptureError, match=r"test_filenames: 1 of its 1 names .*--split every\.\n  images/else\.png"):
         load_capture(tmp_path)
     assert len(load_capture(tmp_path, CaptureOptions(split="every")).views) == 12
+
+
+def test_lists_of_file_names_and_of_frames_that_are_not_there(tmp_path, scene):
+    names = sorted(scene.cameras)
+    write_transforms(tmp_path, scene, train_filenames=names[:9], test_filenames=[*names[9:], "unregistered.png"])
+    capture = load_capture(tmp_path)
+    assert [view.name for view in capture.test_views] == names[9:]
+    assert len(capture.train_views) == 9
+    [said] = capture.warnings
+    assert "test_filenames: 1 of its 4 names" in said
+    assert "(unregistered.png)" in said
+
+
+def test_test_frames_of_scannetpp_are_tested_on(tmp_path, scene):
+    content = write_transforms(tmp_path, scene)
+    content["frames"], content["test_frames"] = content["frames"][:8], content["frames"][8:]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = load_capture(tmp_path)
+    assert_sees_the_scene(capture, scene)
+    assert [view.split for view in capture.views] == ["train"] * 8 + ["test"] * 4
+    assert capture.warnings == ()
+    content["test_frames"] = "none"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=r"must hold a list 'test_frames'"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("top", ["/home/other/place/images/", "C:\\data\\place\\", "../images/", "images/"])
+def test_photographs_of_other_folders_are_found_where_a_person_says(tmp_path, scene, top):
+    content = write_transforms(tmp_path / "nerf", scene)
+    (tmp_path / "nerf" / "images").rename(tmp_path / "photographs")
+    names = [top + each["file_path"].removeprefix("images/") for each in content["frames"]]
+    for each, name in zip(content["frames"], names, strict=True):
+        each["file_path"] = name
+    content["test_filenames"] = names[2:4]
+    (tmp_path / "nerf" / "transforms.json").write_text(json.dumps(content))
+    options = CaptureOptions(images=str(tmp_path / "photographs"))
+    capture = load_capture(tmp_path / "nerf", options)
+    assert_sees_the_scene(capture, scene)
+    assert [view.name for view in capture.test_views] == sorted(scene.cameras)[2:4]
+    (tmp_path / "photographs" / "frame_011.png").unlink()
+    assert any("1 of 12 images" in note for note in load_capture(tmp_path / "nerf", options).warnings)
 
 
 def shifted_by_nerfstudio() -> np.ndarray:

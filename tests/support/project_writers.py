@@ -69,13 +69,16 @@ def write_tracks(file: Path, flight: KnownFlight) -> None:
     file.write_text("\n".join(lines) + "\n")
 
 
-def utm_flight(flight: KnownFlight) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
-    """The zone of UTM; poses and points of the flight in it. Cameras turn with the grid where they are."""
+def utm_flight(flight: KnownFlight, unit: float = 1.0) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
+    """The zone of UTM; poses and points of the flight in it, x, y and z in a unit of so many metres. Cameras turn with
+    the grid where they are."""
+    import pyproj
+
     code = utm_epsg(*ORIGIN[:2])
     crs = open_crs(code, ORIGIN)
 
     def to_utm(enu: np.ndarray) -> np.ndarray:
-        return crs.from_geodetic(geodetic_from_enu(enu, ORIGIN))
+        return crs.from_geodetic(geodetic_from_enu(enu, ORIGIN)) / unit
 
     poses = []
     for pose, center in zip(flight.poses, flight.centers, strict=True):
@@ -86,6 +89,8 @@ def utm_flight(flight: KnownFlight) -> tuple[str, np.ndarray, np.ndarray, np.nda
         moved[:3, :3] = pose[:3, :3] @ (left @ right).T
         moved[:3, 3] = -moved[:3, :3] @ to_utm(center[None])[0]
         poses.append(moved)
+    if unit != 1:
+        code = pyproj.CRS(f"+proj=utm +zone={code[-2:]} +south +datum=WGS84 +to_meter={unit}").to_wkt("WKT1_ESRI")
     return code, np.array(poses), to_utm(flight.points), np.array([to_utm(each[None])[0] for each in flight.centers])
 
 
@@ -301,11 +306,11 @@ def write_realityscan_xmp(folder: Path, flight: KnownFlight, *, as_attributes: b
         )
 
 
-def write_pix4d(project: Path, flight: KnownFlight) -> Path:
+def write_pix4d(project: Path, flight: KnownFlight, unit: float = 1.0) -> Path:
     """1_initial/params as PIX4Dmapper writes it: poses in the system of the project, less an offset."""
     import pyproj
 
-    code, poses, _, centers = utm_flight(flight)
+    code, poses, _, centers = utm_flight(flight, unit)
     offset = np.round(centers.mean(axis=0))
     lens, params = flight.lens, project / "1_initial" / "params"
     params.mkdir(parents=True, exist_ok=True)
@@ -324,11 +329,11 @@ def write_pix4d(project: Path, flight: KnownFlight) -> Path:
     return file
 
 
-def write_opf(folder: Path, flight: KnownFlight) -> Path:
+def write_opf(folder: Path, flight: KnownFlight, unit: float = 1.0) -> Path:
     """project.opf and its files, after the examples of the specification (1.0)."""
     from scipy.spatial.transform import Rotation
 
-    code, poses, points, centers = utm_flight(flight)
+    code, poses, points, centers = utm_flight(flight, unit)
     shift = -np.round(centers.mean(axis=0))
     lens = flight.lens
     (folder / "point_cloud").mkdir(parents=True, exist_ok=True)

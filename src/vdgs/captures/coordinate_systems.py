@@ -34,6 +34,7 @@ _AROUND = " \t\r\n,;'\""
 _ONE_PLACE = 0.2
 #: What is said of systems in feet, where nothing says the unit of heights.
 HEIGHTS_IN_METERS = "; x and y in feet, heights are taken as metres"
+_ALL_IN_FEET = "; x, y and heights in feet"
 #: National datums of which nothing more is known differ from WGS 84 by up to so many metres.
 UNKNOWN_DATUM_M = 300.0
 #: A datum that moves places by less (degrees) is WGS 84 for PROJ.
@@ -85,9 +86,12 @@ def join_definition(lines: Sequence[str]) -> tuple[str, int]:
     return text, count
 
 
-def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple[ToGeodetic, str]:
+def to_geodetic(
+    header: str, file: Path, where: str = "the first line", *, heights_as_xy: bool = False
+) -> tuple[ToGeodetic, str]:
     """What brings x, y, z [n, 3] (x east or longitude) to latitude, longitude and height, and the name of their system,
-    which `header` names; `where` that stands in the file.
+    which `header` names; `where` that stands in the file. Where the system has no heights, z is metres, or
+    `heights_as_xy` in the unit of x and y of a projected system.
 
     Raises UnknownSystem, and CaptureError without pyproj.
     """
@@ -99,6 +103,7 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
         crs = pyproj.CRS.from_user_input(_named(header))
         flat = len(crs.axis_info) == 2
         change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979")
+        up = _unit_without_heights(crs) if heights_as_xy else 1.0
     except pyproj.exceptions.ProjError:
         raise UnknownSystem(
             f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
@@ -114,8 +119,9 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
                 "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
             )
         first, second = (y, x) if _counts_north_first(crs) else (x, y)
-        if flat:  # heights are metres as they are, whatever they are measured from
+        if flat:  # heights are kept, whatever they are measured from
             latitude, longitude = change.transform(first, second)
+            z = z * up
         else:
             latitude, longitude, z = change.transform(first, second, z)
         return np.stack([latitude, longitude, z], axis=1)
@@ -130,8 +136,21 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
             f"; ellipsoid {ellipsoid} but no datum: taken as WGS 84, from which national datums differ by up "
             "to some hundred metres (an EPSG code, or +towgs84, names it)"
         )
-    feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
-    return changed, f"{name}{HEIGHTS_IN_METERS}" if feet else name
+    if flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or ""):
+        name += _ALL_IN_FEET if heights_as_xy else HEIGHTS_IN_METERS
+    return changed, name
+
+
+def unit_without_heights(header: str) -> float:
+    """Metres in the unit of x and y of a projected system that has no heights, and so says no unit of them; 1 for other
+    systems."""
+    import pyproj
+
+    return _unit_without_heights(pyproj.CRS.from_user_input(_named(header)))
+
+
+def _unit_without_heights(crs: Any) -> float:
+    return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0
 
 
 def _counts_north_first(crs: Any) -> bool:

@@ -19,7 +19,7 @@ from vdgs.captures.formats.source_capture import (
 )
 from vdgs.captures.image_files import find_images, is_turned, read_header, readable_suffixes, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
-from vdgs.captures.name_resolution import ImageNameIndex, NameLookup
+from vdgs.captures.name_resolution import ImageNameIndex, find_in_other_folders
 from vdgs.captures.strays import masked_stem
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
@@ -46,7 +46,7 @@ def match_images(
     available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
     found_as: Sequence[str | None] = [available.find(view.name) for view in source.views]
     if not any(found_as):
-        found_as = _elsewhere([view.name for view in source.views], available, folder, warnings)
+        found_as = find_in_other_folders([view.name for view in source.views], available.images, folder, warnings)
     paths = [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]
     there = [path.is_file() for path in paths]
     missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
@@ -67,20 +67,6 @@ def match_images(
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
     return _fitted(root, source, paths, options, warnings), len(spare)
-
-
-def _elsewhere(names: list[str], available: ImageNameIndex, folder: Path, warnings: list[str]) -> Sequence[str | None]:
-    """The names on disk of images whose folders are other ones in the model (`images/a.jpg` for `a.jpg`, or the other
-    way round), a warning where they are; None of each where two would be the same, or one is of several."""
-    lookup = NameLookup((name, name) for name in available.images)
-    found = [lookup.find(name)[1] for name in names]
-    single = [each[0] if len(each) == 1 else None for each in found]
-    known = [name for name in single if name is not None]
-    if not known or len(set(known)) < len(known):
-        return [None] * len(names)
-    first = next(name for name, each in zip(names, single, strict=True) if each is not None)
-    warnings.append(f"the model names images by other folders than those of {folder}: {first} is taken as {known[0]}.")
-    return single
 
 
 def _is_mask(path: Path, stems: set[Path]) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
 from urllib.parse import unquote
@@ -117,6 +117,22 @@ class NameLookup(Generic[T]):
     def find_elsewhere(self, name: str) -> tuple[tuple[int, int], list[T]]:
         """What has the name's file name, in whichever folder."""
         return self.find(PurePosixPath(_posix(name)).name)
+
+
+def find_in_other_folders(
+    names: Sequence[str], available: Collection[str], folder: Path, warnings: list[str]
+) -> Sequence[str | None]:
+    """The names below `folder` of images that a model has in other folders (`images/a.jpg` for `a.jpg`, or the other
+    way round), a warning where they are; None of each where two would be the same, or one is of several."""
+    lookup = NameLookup((name, name) for name in available)
+    found = [lookup.find(name)[1] for name in names]
+    single = [each[0] if len(each) == 1 else None for each in found]
+    known = [name for name in single if name is not None]
+    if not known or len(set(known)) < len(known):
+        return [None] * len(names)
+    first = next(name for name, each in zip(names, single, strict=True) if each is not None)
+    warnings.append(f"the model names images by other folders than those of {folder}: {first} is taken as {known[0]}.")
+    return single
 
 
 def find_one(lookup: NameLookup[T], written: str, where: str, name_of: Callable[[T], str]) -> T:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
@@ -26,6 +27,9 @@ _REALITYSCAN = (
     "a project of RealityScan; what it exports (Registration: Internal/External camera parameters, CSV, with the "
     "sparse point cloud as PLY) is read"
 )
+_POLYCAM = "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
+_RECORD3D = "poses of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of them, which is read"
+_AS_OTHERS = "a BlocksExchange, OPF or Agisoft XML file of the same project is read"
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
     "*.psx": _METASHAPE,
@@ -47,40 +51,52 @@ _OTHERS = {
     ),
     "*.mg": "a project of Meshroom; cameras.sfm of its step StructureFromMotion is read",
     "sfm.abc": "poses of Meshroom in Alembic; cameras.sfm beside it, or the .sfm of its step ConvertSfMFormat, is read",
-    "Ori-*/Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
+    "Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
     "sensors/trajectories.txt": "poses of Kapture; kapture_export_colmap.py makes a COLMAP model, which is read",
     "*.mvs": "a scene of OpenMVS; the COLMAP or OpenMVG model that it was made of is read",
-    "keyframes/*cameras/*.json": (
-        "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
-    ),
+    "keyframes/*cameras/*.json": _POLYCAM,
     "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
-    "cameras_sphere.npz": "poses of NeuS; the COLMAP model that they were made of is read",
+    "cameras*.npz": "poses of IDR or NeuS; the COLMAP model that they were made of is read",
+    "dataparser_transforms.json": (
+        "what nerfstudio's training wrote; the transforms.json or COLMAP model that it was trained on is read"
+    ),
+    "synth_0.out": "poses of MVE; the .nvm or bundle.out that its makescene was given is read",
+    "*.ori": f"orientations of PATB; {_AS_OTHERS}",
+    "itera.dat": f"orientations of BINGO; {_AS_OTHERS}",
     "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
-#: The same for files that only their beginning tells: the suffix, a text of it in lower case, and what it is.
+#: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
 _ALIGN = "it is read once its photographs are aligned and it is exported again"
 _BY_CONTENT = (
-    (".xml", b"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
-    (".xml", b"<document version", f"an export of Metashape without poses; {_ALIGN}"),
-    (".json", b'"has_mono_prior"', "poses of SDFStudio; the transforms.json or COLMAP model of the same data is read"),
+    (".xml", rb"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
+    (".xml", rb"<document version", f"an export of Metashape without poses; {_ALIGN}"),
+    (".json", rb'"has_mono_prior"', "poses of SDFStudio; the transforms.json or COLMAP model of the same data is read"),
+    # The phone writes the keys in any order, and the lists are long.
+    (".json", rb'"(initpose|perframeintrinsiccoeffs|frametimestamps)"|\A\s*{\s*"poses"\s*:\s*\[\s*\[', _RECORD3D),
+    (".json", rb'"t_00"\s*:', _POLYCAM),
     (
-        ".json", b'"initpose"',
-        "poses of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of them, which is read",
-    ),
-    (
-        ".json", b'"transform_matrix"',
+        ".json", rb'"transform_matrix"',
         "a file of poses like transforms.json, by another name; rename it to transforms.json, which is read",
     ),
     (".json", b'"img_name"', "cameras of a trained 3DGS scene; the capture that it was trained on is read"),
     (".json", b'"sfm_data_version"', "photographs of OpenMVG without poses; the sfm_data.json after its SfM is read"),
     (".sfm", b'"viewid"', "photographs of Meshroom without poses; cameras.sfm of its step StructureFromMotion is read"),
     (
-        ".txt", b"photoid, x, y, z, omega",
+        ".txt", rb"photoid, x, y, z, omega",
         "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",
     ),
+    (".txt", rb"\A\s*extrinsic\s", "cameras of MVSNet; the COLMAP model that they were made of is read"),
     (
-        ".prj", b"$project",
+        ".log", rb"\A\s*\d+ +\d+ +\d+\s*\n(\s*[-+.\de]+){16}\s",
+        "poses of Tanks and Temples without lenses; the COLMAP model that they were made of is read",
+    ),
+    (
+        ".csv", rb"\A\s*timestamp, *frame, *x, *y, *z, *qx",
+        "poses of Stray Scanner; the film beside it is read without them: vdgs sfm rgb.mp4 --output CAPTURE",
+    ),
+    (
+        ".prj", rb"\$project",
         "a project of Inpho; Metashape imports it (File > Import > Import Cameras), and its Agisoft XML is read",
     ),
 )  # fmt: skip
@@ -93,7 +109,9 @@ _LEAST_BYTES = 20
 
 
 def model_below(root: Path) -> str | None:
-    """What to say of a capture, or a model, in a folder below `root`; None where there is none."""
+    """What to say of a capture in a folder below `root`, or of a model without photographs where there is no capture;
+    None where there is neither."""
+    alone: Path | None = None
     for folder in _folders(root):
         if not is_capture(folder):
             continue
@@ -105,31 +123,37 @@ def model_below(root: Path) -> str | None:
                 f"{shell_word(root)} --output RUN"
             )
         if _has_photographs(folder):
-            return f"{folder} is a capture: vdgs run {shell_word(folder)} --output RUN"
-        models = find_models(folder)
-        if models:
-            biggest = max(models, key=count_images)
-            photographs = _photographs_beside(root, folder)
-            link = f"ln -s {shell_word(photographs.resolve())} {shell_word(folder / 'images')}; " if photographs else ""
-            return (
-                f"{biggest} is a COLMAP model of {count_images(biggest)} photographs. To "
-                f"use it, put them beside it as images: {link}vdgs run {shell_word(folder)} --output RUN"
-            )
-    return None
+            return f"{folder} is a capture: vdgs run {shell_word(folder)}{_images_beside(root, folder)} --output RUN"
+        alone = alone or (folder if find_models(folder) else None)
+    if alone is None:
+        return None
+    biggest = max(find_models(alone), key=count_images)
+    photographs = _photographs_beside(root, alone)
+    link = f"ln -s {shell_word(photographs.resolve())} {shell_word(alone / 'images')}; " if photographs else ""
+    return (
+        f"{biggest} is a COLMAP model of {count_images(biggest)} photographs. To use it, put them beside it as images: "
+        f"{link}vdgs run {shell_word(alone)} --output RUN"
+    )
+
+
+def _images_beside(root: Path, capture: Path) -> str:
+    """What a command adds for a capture whose photographs lie beside it in `root`, and not in it."""
+    images = (path for path in capture.rglob("*") if path.suffix.lower() in readable_suffixes())
+    photographs = None if next(images, None) is not None else _photographs_beside(root, capture)
+    return f" --images {shell_word(photographs)}" if photographs is not None else ""
 
 
 def foreign_poses(root: Path) -> list[str]:
-    """Poses below `root` that other programs made and that are not read, and what makes a capture of them."""
-    found = []
+    """Poses below `root` that other programs made and that are not read, and what makes a capture of them: of each kind
+    one file, for some programs write one for each photograph."""
+    found: dict[str, Path] = {}
     for folder in (root, *_folders(root)):
         known = [(next(iter(sorted(folder.glob(name))), None), what) for name, what in _OTHERS.items()]
         known += [(file, _by_content(file)) for file in sorted(folder.iterdir())]
-        found += [
-            f"{file.relative_to(root).as_posix()}: {what}"
-            for file, what in known
-            if file is not None and what and file.is_file() and file.stat().st_size > _LEAST_BYTES
-        ]
-    return found
+        for file, what in known:
+            if file is not None and what and file.is_file() and file.stat().st_size > _LEAST_BYTES:
+                found.setdefault(what, file)
+    return [f"{file.relative_to(root).as_posix()}: {what}" for what, file in found.items()]
 
 
 def check_no_foreign_file(path: Path) -> None:
@@ -159,7 +183,7 @@ def _capture_of(file: Path) -> Path | None:
 
 def _by_content(file: Path) -> str:
     """What a file is of those that only their beginning tells; empty for others."""
-    known = [(text, what) for suffix, text, what in _BY_CONTENT if file.suffix.lower() == suffix]
+    known = [(pattern, what) for suffix, pattern, what in _BY_CONTENT if file.suffix.lower() == suffix]
     if not known or not file.is_file():
         return ""
     try:
@@ -167,7 +191,7 @@ def _by_content(file: Path) -> str:
             head = stream.read(_HEAD_BYTES).lower()
     except OSError:
         return ""
-    return next((what for text, what in known if text in head), "")
+    return next((what for pattern, what in known if re.search(pattern, head)), "")
 
 
 def _folders(root: Path) -> Iterator[Path]:

@@ -18,7 +18,6 @@ from vdgs.captures.capture import View
 from vdgs.captures.formats.colmap import find_models, read_colmap
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.image_matching import MatchedView, match_images
-from vdgs.captures.name_resolution import ImageNameIndex
 from vdgs.captures.splits import VALIDATION_LIST, listed_photographs
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -47,7 +46,9 @@ def match_off_path(root: Path, options: CaptureOptions, warnings: list[str]) -> 
                 f"{folder}: {photo.view.name} is bent by its lens. Undistort these photographs first, or remove "
                 f"{folder}."
             )
-    names = ImageNameIndex({photo.view.name: photo.file.path for photo in photographs})
-    own = folder / VALIDATION_LIST
-    validation = listed_photographs(own, names, some=False) if own.is_file() else set()
+    own, validation = folder / VALIDATION_LIST, set[str]()
+    if own.is_file():
+        names = [photo.view.name for photo in photographs]
+        validation, notes = listed_photographs(own, names, some=False, strict=options.strict)
+        warnings += notes
     return [photo for photo in photographs if (photo.view.name in validation) == options.validation]

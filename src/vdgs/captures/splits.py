@@ -1,13 +1,14 @@
 """Which photographs train and which test.
 
-A capture may bring its own lists, `test.txt` and `validation.txt` beside its photographs' folder, one name a line.
-Photographs of either list never train; those of `validation.txt` are used with `--validation` only. Formats may say
-it too; where one says it of some photographs only, the others are left out, as nerfstudio does.
+A capture may bring its own lists, `test.txt` and `validation.txt` beside its photographs' folder or beside its COLMAP
+model, where 3DGS reads them, one name a line. Photographs of either list never train; those of `validation.txt` are
+used with `--validation` only. Formats may say it too; where one says it of some photographs only, the others are left
+out, as nerfstudio does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -16,12 +17,12 @@ import numpy as np
 
 from vdgs.captures.capture import Split, View
 from vdgs.captures.flight_parts import MIN_STRIP, OBLIQUE_DEGREES, flight_strips, oblique_views
-from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.name_resolution import ImageNameIndex
+from vdgs.captures.formats.colmap import find_models
+from vdgs.captures.listed_names import find_listed
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
-#: Lists that a capture may bring, in its root folder.
+#: Lists that a capture may bring.
 TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
 #: Splits that follow from positions and headings.
 _BY_FLIGHT = ("strips", "obliques")
@@ -48,8 +49,8 @@ def assign_splits(
     gives it. Raises `CaptureError` if a side stays empty or a list names what is no photograph.
     """
     views = sorted(views, key=lambda view: view.name)
-    names = ImageNameIndex({name: root / name for name in explicit})
-    splits = _splits(root, views, explicit, options, names)
+    names = list(explicit)
+    splits = _splits(root, views, explicit, options, warnings)
     chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True) if split is not None]
     unlisted = [view.name for view, split in zip(views, splits, strict=True) if split is None]
     if unlisted and options.split not in _BY_FLIGHT:
@@ -58,13 +59,13 @@ def assign_splits(
             f"{len(unlisted)} of {len(views)} photographs stand in none of the capture's lists of training and test "
             f"photographs and are left out ({shown}). --split every uses them all."
         )
-    own = root / VALIDATION_LIST
+    own = _list_of(root, VALIDATION_LIST)
     if options.split in _BY_FLIGHT:
         pass  # they know of validation themselves
-    elif own.is_file() and options.split != "every":
-        chosen = _with_validation_list(
-            chosen, listed_photographs(own, names, some=options.validation), options.validation
-        )
+    elif own is not None and options.split != "every":
+        listed, notes = listed_photographs(own, names, some=options.validation, strict=options.strict)
+        chosen = _with_validation_list(chosen, listed, options.validation)
+        warnings += notes
     elif options.validation:
         kept = [view for view in chosen if view.split == "train"]
         chosen = [replace(v, split="train" if i % options.test_every else "test") for i, v in enumerate(kept)]
@@ -77,19 +78,24 @@ def assign_splits(
     return chosen
 
 
+def _list_of(root: Path, name: str) -> Path | None:
+    """A list that a capture brings: in its folder, or beside its COLMAP model."""
+    files = (folder / name for folder in (root, *find_models(root)))
+    return next((file for file in files if file.is_file()), None)
+
+
 def _splits(
-    root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions, names: ImageNameIndex
+    root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions, warnings: list[str]
 ) -> list[Split | None]:
     """The split of each view: by the list asked for, the capture's list, its format (None where that knows others
     only), or every n-th."""
-    listed = options.test_list
-    if listed is None and (root / TEST_LIST).is_file():
-        listed = root / TEST_LIST
+    listed = options.test_list or _list_of(root, TEST_LIST)
     if options.split in _BY_FLIGHT:
         return _splits_by_flight(root, views, options)
     if options.split != "every":
         if listed is not None:
-            tests = listed_photographs(listed, names, some=True)
+            tests, notes = listed_photographs(listed, list(explicit), some=True, strict=options.strict)
+            warnings += notes
             return ["test" if view.name in tests else "train" for view in views]
         if any(split is not None for split in explicit.values()):
             return [explicit[view.name] for view in views]
@@ -140,9 +146,11 @@ def _with_validation_list(views: list[View], listed: set[str], validation: bool)
     return [replace(view, split="test" if view.name in listed else "train") for view in kept]
 
 
-def listed_photographs(file: Path, names: ImageNameIndex, some: bool) -> set[str]:
-    """The photographs named in a text file, one a line; extensions and case may differ. CaptureError for a list that
-    cannot be read, names what is no photograph, or names nothing where `some` are needed."""
+def listed_photographs(
+    file: Path, names: Sequence[str], *, some: bool, strict: bool = False
+) -> tuple[set[str], list[str]]:
+    """Those of `names` that a text file lists, one a line, and a warning about its lines that mean none of them. Raises
+    CaptureError for a list that cannot be read or names nothing where `some` are needed, and as `find_listed`."""
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -154,11 +162,4 @@ def listed_photographs(file: Path, names: ImageNameIndex, some: bool) -> set[str
         raise CaptureError(
             f"{file}: names no photograph. Write one image name a line, or ignore lists with --split every."
         )
-    found = {name: names.find(name) for name in wanted}
-    unknown = [name for name, match in found.items() if match is None]
-    if unknown:
-        raise CaptureError(
-            f"{file}: {len(unknown)} of its names are not photographs of this capture. "
-            f"Write one image name a line, or ignore lists with --split every.{format_list(unknown)}"
-        )
-    return {match for match in found.values() if match is not None}
+    return find_listed(wanted, names, str(file), strict=strict)

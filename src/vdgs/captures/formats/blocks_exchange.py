@@ -11,6 +11,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
 
@@ -19,6 +20,7 @@ import numpy as np
 from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_in_degrees, is_local_system, to_geodetic
 from vdgs.captures.formats.block_rotations import ASK_FOR_MATRIX, Rolled, block_rotation, has_roll, told_by_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fisheye
+from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
@@ -64,6 +66,8 @@ class _Photo:
     name: str
     intrinsics: Intrinsics
     pose: np.ndarray
+    bands: tuple[str, ...]
+    """What the file calls them; none where it says nothing."""
     other_roll: np.ndarray | None = None
     """Its pose with the roll turned the other way, where the file has one."""
     sightings: tuple[list[int], list[tuple[float, float]]] = field(default_factory=lambda: ([], []))
@@ -90,7 +94,7 @@ class _Block:
         blocks = self._root.findall("Block")
         if len(blocks) > 1:
             raise CaptureError(f"{self._file}: holds {len(blocks)} blocks. Export one alone.")
-        warnings = self._settle_roll()
+        warnings = self._leave_out_bands() + self._settle_roll()
         geodetic, in_degrees, place, frames = self._system(blocks[0] if blocks else None)
         self._without_pose += map(_path, self._root.iterfind("Block/BulkPhotos/Photo"))
         if self._without_pose:
@@ -107,6 +111,12 @@ class _Block:
             to_geodetic=geodetic, in_degrees=in_degrees, is_metric=True, place=place, cloud_frames=frames,
             warnings=tuple(warnings), refused=self._refused, unknown_system=self._unknown,
         )  # fmt: skip
+
+    def _leave_out_bands(self) -> list[str]:
+        """Keep the photographs in color; what is to be said of the others."""
+        in_color, warnings = color_cameras([(photo.name, photo.bands) for photo in self._photos.values()])
+        self._photos = dict(compress(self._photos.items(), in_color))
+        return warnings
 
     def _refuse(self, error: CaptureError, photos: Iterable[Element]) -> None:
         why = str(error).removeprefix(f"{self._file}: ").rstrip(".")
@@ -143,11 +153,11 @@ class _Block:
         except CaptureError as error:
             self._refuse(error, posed)
             return
-        axes = self._axes(group, label)
+        axes, band = self._axes(group, label), (group.findtext("CameraModelBand") or "").strip()
         for photo in posed:
-            self._photo(photo, intrinsics, axes)
+            self._photo(photo, intrinsics, axes, (band,) if band else ())
 
-    def _photo(self, photo: Element, intrinsics: Intrinsics, axes: np.ndarray) -> None:
+    def _photo(self, photo: Element, intrinsics: Intrinsics, axes: np.ndarray, bands: tuple[str, ...]) -> None:
         name = _path(photo)
         self._masks += photo.find("MaskPath") is not None
         number = (photo.findtext("Id") or f"#{len(self._photos)}").strip()
@@ -163,7 +173,8 @@ class _Block:
         poses = [to_rigid(np.column_stack([each, np.zeros(3)]), self._file, name) for each in rotations]
         for pose in poses:
             pose[:3, 3] = -pose[:3, :3] @ center
-        self._photos[number] = _Photo(name, intrinsics, poses[0], poses[1] if has_roll(element, self._file) else None)
+        other_roll = poses[1] if has_roll(element, self._file) else None
+        self._photos[number] = _Photo(name, intrinsics, poses[0], bands, other_roll)
 
     def _place(self, element: Element | None, label: str) -> list[float]:
         if element is None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics, check_intrinsics
+from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics, check_intrinsics, say_of_panoramas
 from vdgs.errors import CaptureError
 
 #: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree, and
@@ -60,10 +60,9 @@ def _chance(numbers: np.ndarray) -> np.ndarray:
 
 def unsupported_model(file: Path, where: str, model: str) -> CaptureError:
     """The error of a camera model that is not read."""
-    panoramas = " Panoramas of 360° are read without a model: vdgs sfm IMAGES --output CAPTURE"
     return CaptureError(
         f"{file}: {where}: {model} is no camera model that is supported. Supported: {', '.join(MODEL_PARAMETERS)}."
-        f"{panoramas if 'EQUIRECTANGULAR' in model else ''}"
+        f"{say_of_panoramas(model)}"
     )
 
 

@@ -16,6 +16,7 @@ from vdgs.captures.formats.source_capture import (
     Intrinsics,
     check_centered,
     check_intrinsics,
+    say_of_panoramas,
     to_rigid,
 )
 from vdgs.captures.image_files import read_header, same_aspect
@@ -46,11 +47,11 @@ def read_capture_json(file: Path) -> JsonObject:
     return content
 
 
-def get_frames(content: JsonObject, file: Path) -> list[JsonObject]:
+def get_frames(content: JsonObject, file: Path, key: str = "frames") -> list[JsonObject]:
     """The list of frames. Raises `CaptureError` if there are none."""
-    frames = content.get("frames")
+    frames = content.get(key)
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise CaptureError(f"{file}: must hold a list 'frames' of posed images, and it has none.")
+        raise CaptureError(f"{file}: must hold a list {key!r} of posed images, and it has none.")
     return frames
 
 
@@ -215,7 +216,10 @@ def _camera_model(values: JsonObject, file: Path) -> str:
     model = str(values.get("camera_model") or "OPENCV").upper()
     for key in _OTHER_LENSES:
         if values.get(key) is not None and values[key] is not False:
-            raise CaptureError(f"{file}: the lens that {key!r} describes is not supported; undistort to PINHOLE first.")
+            raise CaptureError(
+                f"{file}: the lens that {key!r} describes is not supported; undistort to PINHOLE first."
+                f"{say_of_panoramas(key)}"
+            )
     if not values.get("is_fisheye") or model in _FISHEYE:
         return model
     if values.get("camera_model"):
@@ -234,7 +238,7 @@ def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float
     if model not in _PERSPECTIVE:
         raise CaptureError(
             f"{file}: the camera model {model!r} is not supported; undistort the images to PINHOLE first (fisheyes of "
-            "other models than OPENCV_FISHEYE: colmap image_undistorter)."
+            f"other models than OPENCV_FISHEYE: colmap image_undistorter).{say_of_panoramas(model)}"
         )
     if not any(k.values()):
         return "PINHOLE", ()

@@ -7,6 +7,7 @@ left-handed, and shifted.
 
 from __future__ import annotations
 
+from itertools import compress
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -15,6 +16,7 @@ import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_local_system, to_geodetic
 from vdgs.captures.formats.brown_lens import MAX_POWERS, brown_intrinsics, quarter_turn_fisheye
+from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.gltf_points import GltfPoints, join_points, read_gltf_points
 from vdgs.captures.formats.json_poses import (
     OPENGL_FROM_OPENCV,
@@ -57,19 +59,26 @@ def read(file: Path, options: CaptureOptions) -> Project:
         for each in _dicts(read_capture_json(list_file), "cameras", list_file)
     }
     where, cloud = items.path("calibrated-cameras") or file, _points(items)
-    views, refused, warnings, used = list[ProjectView](), dict[str, list[str]](), list[str](), set[int]()
-    for camera in _dicts(calibrated, "cameras", where):
-        number, sensor = _number(camera, "id", where), _number(camera, "sensor_id", where)
-        name = photograph_name(uris.get(number, f"camera {number}"))
+    views, refused = list[ProjectView](), dict[str, list[str]]()
+    listed = [
+        (camera, _number(camera, "id", where), _number(camera, "sensor_id", where))
+        for camera in _dicts(calibrated, "cameras", where)
+    ]
+    names, bands = {number: photograph_name(uri) for number, uri in uris.items()}, _bands(items)
+    in_color, warnings = color_cameras(
+        [(names.get(number, f"camera {number}"), bands.get(sensor, ())) for _, number, sensor in listed]
+    )
+    for camera, number, sensor in compress(listed, in_color):
+        name = names.get(number, f"camera {number}")
         lens = sensors.get(sensor, f"its sensor {sensor} is not calibrated")
-        used.add(number)
         if isinstance(lens, str):
             refused.setdefault(lens, []).append(name)
             continue
         pose = _pose(camera, where, f"camera {number}")
         seen = cloud.shown.get(number)
         views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=seen))
-    warnings += name_unaligned([photograph_name(uri) for number, uri in uris.items() if number not in used])
+    calibrated_ids = {number for _, number, _ in listed}
+    warnings += name_unaligned([name for number, name in names.items() if number not in calibrated_ids])
     rolling = sum(_rolls(camera.get("rolling_shutter")) for camera in calibrated["cameras"])
     if rolling:
         warnings.append(f"the rolling shutter of {rolling} photographs is not modelled.")
@@ -163,6 +172,18 @@ def _sensors(items: _Items, calibrated: JsonObject, file: Path) -> dict[int, Int
     return found
 
 
+def _bands(items: _Items) -> dict[int, tuple[str, ...]]:
+    """The names of the bands that sensors show, by the numbers of the sensors, where the project says them."""
+    file = items.path("input-cameras")
+    sensors = _dicts(read_capture_json(file), "sensors", file) if file is not None else []
+    listed = {_number(each, "id", file or items.file): each.get("bands") for each in sensors}
+    return {
+        number: tuple(str(band.get("name", "")) for band in bands if isinstance(band, dict))
+        for number, bands in listed.items()
+        if isinstance(bands, list)
+    }
+
+
 def _perspective(inside: JsonObject, size: np.ndarray, file: Path, label: str) -> Intrinsics:
     focal = parse_number(inside, "focal_length_px", file) or 0.0
     center = parse_vector(inside.get("principal_point_px"), 2, file, f"{label}: 'principal_point_px'")
@@ -224,21 +245,12 @@ def _system(items: _Items) -> tuple[ToGeodetic | None, str, bool]:
     if (scale <= 0).any():
         raise CaptureError(f"{file}: 'scale' must be positive. {_AGAIN}")
     geoid = parse_number(crs, "geoid_height", file) or 0.0
-    known, name = to_geodetic(definition, file, "'definition'")
-    meters = np.array([1.0, 1.0, _height_unit(definition)])
+    known, name = to_geodetic(definition, file, "'definition'", heights_as_xy=True)
     order = [1, 0, 2] if change.get("swap_xy") else [0, 1, 2]
 
     def to_earth(points: np.ndarray) -> np.ndarray:
         base = (points - shift)[:, order] / scale
         # The system is told with its own axes; what is asked has x to the east.
-        return known(base[:, order] * meters) + np.array([0.0, 0.0, geoid])
+        return known(base[:, order]) + np.array([0.0, 0.0, geoid])
 
     return to_earth, f"OPF, {name}", False
-
-
-def _height_unit(definition: str) -> float:
-    """Metres in the unit of heights, of systems that have none: there they are in the unit of the others."""
-    import pyproj
-
-    crs = pyproj.CRS.from_user_input(definition)
-    return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0

@@ -103,7 +103,8 @@ def _system(file: Path) -> tuple[ToGeodetic | None, str, bool, tuple[CloudFrame,
     if not wkt or is_local_system(wkt):
         is_metric = bool(wkt) or bool(offset.any())
         return None, "Pix4D, metres of a system of its own" if is_metric else "", is_metric, ()
-    change, name = to_geodetic(wkt, system_file, "the file")
+    # One camera model holds for x, y and z, which so have one unit.
+    change, name = to_geodetic(wkt, system_file, "the file", heights_as_xy=True)
     return lambda points: change(points + offset), f"Pix4D, {name}", False, ((f"of {name}", change),)
 
 

@@ -7,8 +7,9 @@ millimetres of the sensor, and in files before version 1.2.2 in pixels. The worl
 
 from __future__ import annotations
 
+import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,13 +20,14 @@ from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.formats.xml_documents import files_ending, holds
+from vdgs.captures.formats.xml_documents import files_ending, holds, holds_match
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
 _OPENMVG = b'"sfm_data_version"'
+_OPENMVG_POSES = re.compile(rb'"extrinsics"\s*:\s*\[\s*\{')
 _AGAIN = "Export it again."
 #: AliceVision's kinds of lenses, as its versions call them, by the terms of `_lens`.
 _ALICEVISION = {
@@ -33,6 +35,8 @@ _ALICEVISION = {
     "brown": "brown", "fisheye4": "fisheye", "fisheye": "fisheye", "radialk3pt": "radial at one",
     "equidistant": "equidistant", "equidistant_r3": "equidistant", "equidistant radialk3pt": "equidistant",
 }  # fmt: skip
+#: How AliceVision writes that a photograph is of no rig.
+_OF_NO_RIG = {"None", "-1", "4294967295"}
 #: OpenMVG's, by the name of their parameters.
 _PARAMETERS = {"disto_k1": "radial", "disto_k3": "radial", "disto_t2": "brown", "fisheye": "fisheye"}
 
@@ -46,8 +50,8 @@ def is_alicevision(file: Path) -> bool:
 
 
 def find_openmvg(root: Path) -> list[Path]:
-    """The files of a folder that have poses; the one that lists the photographs has none."""
-    return [file for file in files_ending(root, ".json") if is_openmvg(file) and holds(file, b'"center"')]
+    """The files of a folder that have poses; the one that lists the photographs has none, though places by GPS."""
+    return [file for file in files_ending(root, ".json") if is_openmvg(file) and holds_match(file, _OPENMVG_POSES)]
 
 
 def find_alicevision(root: Path) -> list[Path]:
@@ -84,15 +88,10 @@ def read_alicevision(file: Path, options: CaptureOptions) -> Project:
         str(entry["intrinsicId"]): _alicevision_lens(entry, version, file)
         for entry in _entries(content, "intrinsics", "intrinsicId", file)
     }
-    poses = {
-        str(entry["poseId"]): _pose(
-            _dict(_dict(entry.get("pose")).get("transform")), file, f"pose {entry['poseId']}", turned=True
-        )
-        for entry in _entries(content, "poses", "poseId", file)
-    }
+    pose_of = _alicevision_poses(content, file)
     views = [
         (str(entry["viewId"]), str(entry.get("path") or f"view {entry['viewId']}"), str(entry.get("intrinsicId")),
-         poses.get(str(entry.get("poseId"))))
+         pose_of(entry))
         for entry in _entries(content, "views", "viewId", file)
     ]  # fmt: skip
     seen = [
@@ -145,6 +144,35 @@ def _pose(transform: JsonObject, file: Path, label: str, *, turned: bool) -> np.
     pose = to_rigid(np.column_stack([rotation.T if turned else rotation, np.zeros(3)]), file, label)
     pose[:3, 3] = -pose[:3, :3] @ center
     return pose
+
+
+def _alicevision_poses(content: JsonObject, file: Path) -> Callable[[JsonObject], np.ndarray | None]:
+    """What finds the pose of a view, None where it has none. A view of a rig has that of the rig, then its camera's
+    within the rig (`subPoses`), unless it is independent of it."""
+    poses = {
+        str(entry["poseId"]): _pose(
+            _dict(_dict(entry.get("pose")).get("transform")), file, f"pose {entry['poseId']}", turned=True
+        )
+        for entry in _entries(content, "poses", "poseId", file)
+    }
+    within: dict[tuple[str, str], np.ndarray | None] = {}
+    for rig in _entries(content, "rigs", "rigId", file):
+        for index, entry in enumerate(_entries(rig, "subPoses", "pose", file)):
+            known = str(entry.get("status", "")).lower() != "uninitialized"
+            label = f"sub-pose {index} of rig {rig['rigId']}"
+            within[str(rig["rigId"]), str(index)] = (
+                _pose(_dict(entry["pose"]), file, label, turned=True) if known else None
+            )
+
+    def pose_of(view: JsonObject) -> np.ndarray | None:
+        pose, rig = poses.get(str(view.get("poseId"))), str(view.get("rigId"))
+        is_independent = str(view.get("isPoseIndependant", "true")).lower() not in ("0", "false")
+        if pose is None or is_independent or rig in _OF_NO_RIG:
+            return pose
+        inside = within.get((rig, str(view.get("subPoseId"))))
+        return None if inside is None else inside @ pose
+
+    return pose_of
 
 
 def _points(seen: Iterable[tuple[object, object, list[tuple[str, JsonObject]]]], file: Path) -> _TiePoints:

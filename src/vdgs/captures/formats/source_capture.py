@@ -217,6 +217,12 @@ def safe_name(name: str, file: Path, what: str = "image name", root: Path | None
     return str(PurePosixPath(posix))
 
 
+def say_of_panoramas(lens: str) -> str:
+    """What to add to the refusal of a lens that is one of panoramas; nothing of others."""
+    is_panorama = any(name in lens.upper() for name in ("EQUIRECTANGULAR", "LATLONG"))
+    return " Panoramas of 360° are read without a model: vdgs sfm IMAGES --output CAPTURE" if is_panorama else ""
+
+
 def no_points(root: Path, what: str, other: str) -> NoTiePoints:
     """The error of a capture whose poses come without points: what finds them, and what else to do."""
     return NoTiePoints(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,6 @@ from vdgs.captures.formats.source_capture import (
     SourceCapture,
     SourceView,
     find_image,
-    format_list,
     leave_out_bad_poses,
     one_view_each,
     refuse_many_missing,
@@ -35,7 +35,9 @@ from vdgs.captures.formats.source_capture import (
     to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.name_resolution import ImageNameIndex, find_file, largest_shrunk
+from vdgs.captures.image_files import find_images
+from vdgs.captures.listed_names import find_listed
+from vdgs.captures.name_resolution import find_file, find_in_other_folders, largest_shrunk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -45,6 +47,9 @@ TRANSFORMS_FILE = "transforms.json"
 SPLIT_LISTS: tuple[tuple[str, Split], ...] = (
     ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
 )  # fmt: skip
+
+#: Where ScanNet++ has the frames that are for testing, beside those that train.
+TEST_FRAMES = "test_frames"
 
 
 def is_transforms(path: Path) -> bool:
@@ -60,7 +65,8 @@ def exclusive_information(file: Path) -> str:
         masked = any(frame.get("mask_path") for frame in get_frames(content, file))
     except CaptureError:
         return ""
-    lists = "lists of training and test photographs" if any(content.get(key) for key, _ in SPLIT_LISTS) else ""
+    has_lists = any(content.get(key) for key in (TEST_FRAMES, *(key for key, _ in SPLIT_LISTS)))
+    lists = "lists of training and test photographs" if has_lists else ""
     return " and ".join(filter(None, (lists, "masks" if masked else "")))
 
 
@@ -74,16 +80,16 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     file = root / TRANSFORMS_FILE
     content = read_capture_json(file)
     frames = get_frames(content, file)
-    names = [_name(frame, file, root) for frame in frames]
-    folder = _common_folder(names)
-    chosen, notes = _image_folder(root, folder, options)
-    splits = _splits(content, names, file, root, options)
+    held_out = get_frames(content, file, TEST_FRAMES) if content.get(TEST_FRAMES) else []
+    count, frames = len(frames), [*frames, *held_out]
+    photographs = _find_photographs([_file_path(frame, file) for frame in frames], file, root, options)
+    names, chosen, notes = photographs.names, photographs.folder, photographs.notes
+    splits: dict[str, Split] = {name: "test" if k >= count else "train" for k, name in enumerate(names) if held_out}
+    splits |= _splits(content, names, file, options, notes)
     undo = _undo_applied(content, file)
     views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
     bad = dict[str, CaptureError]()
-    for frame, name in zip(frames, names, strict=True):
-        short = name.removeprefix(folder + "/") if folder else name
-        image = find_image(root, f"{chosen}/{short}" if chosen else short)
+    for frame, name, short, image in zip(frames, names, photographs.shorts, photographs.images, strict=True):
         if image is None:
             missing.append(short)
             continue
@@ -125,11 +131,44 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     )
 
 
-def _name(frame: JsonObject, file: Path, root: Path) -> str:
+def _file_path(frame: JsonObject, file: Path) -> str:
     path = frame.get("file_path")
     if not isinstance(path, str):
         raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
-    return safe_name(path, file, "file_path", root)
+    return path
+
+
+class _Photographs(NamedTuple):
+    """Of each frame the name in the capture, that in the folder of the photographs, and the file, if it is there."""
+
+    names: list[str]
+    shorts: list[str]
+    images: list[Path | None]
+    folder: str
+    notes: list[str]
+
+
+def _find_photographs(written: list[str], file: Path, root: Path, options: CaptureOptions) -> _Photographs:
+    """By the paths that frames have in the file; where none of these is in the folder that `--images` names, by their
+    ends: they may be of another folder or machine. Raises `CaptureError` for paths that leave the capture."""
+    outside = None
+    try:
+        names = [safe_name(path, file, "file_path", root) for path in written]
+    except CaptureError as error:
+        outside, names = error, []
+    folder = _common_folder(names)
+    chosen, notes = _image_folder(root, folder, options)
+    shorts = [name.removeprefix(folder + "/") if folder else name for name in names]
+    images = [find_image(root, f"{chosen}/{short}" if chosen else short) for short in shorts]
+    if options.images is not None and not any(images):
+        there = find_images(root / chosen)
+        found = find_in_other_folders(written, there, root / chosen, notes)
+        if any(found):
+            names = [name or path for name, path in zip(found, written, strict=True)]
+            return _Photographs(names, names, [there.get(name) for name in names], chosen, notes)
+    if outside is not None:
+        raise CaptureError(f"{outside} Or say which folder they are in: --images FOLDER") from outside
+    return _Photographs(names, shorts, images, chosen, notes)
 
 
 def _mask(frame: JsonObject, file: Path, root: Path) -> Path | None:
@@ -154,27 +193,25 @@ def _image_folder(root: Path, named: str, options: CaptureOptions) -> tuple[str,
     return shrunk or named, [f"no {named}/ folder; {shrunk} is used instead (--images chooses)."] if shrunk else []
 
 
-def _splits(content: JsonObject, names: list[str], file: Path, root: Path, options: CaptureOptions) -> dict[str, Split]:
-    """Splits by file_path (`names`) where train_filenames and val_filenames or test_filenames are given.
+def _splits(
+    content: JsonObject, names: list[str], file: Path, options: CaptureOptions, notes: list[str]
+) -> dict[str, Split]:
+    """Splits of frames (`names`) where train_filenames and val_filenames or test_filenames are given.
 
     Frames in no list have none; where one side has no list at all, it takes them (choice). Raises `CaptureError`
-    where lists that are not ignored name what is no frame.
+    where a list that is not ignored names no frame.
     """
     splits: dict[str, Split] = {}
-    frames, sides_listed, unknown = ImageNameIndex({name: root / name for name in names}), set[Split](), list[str]()
+    sides_listed = set[Split]()
     for key, side in SPLIT_LISTS:
         listed = content.get(key) or []
         if not isinstance(listed, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
-        found = {str(name): frames.find(safe_name(str(name), file, f"name in {key}", root)) for name in listed}
-        splits.update({name: side for name in found.values() if name is not None})
-        unknown += [name for name, frame in found.items() if frame is None]
-        sides_listed |= {side} if listed else set()
-    if unknown and options.split != "every":
-        raise CaptureError(
-            f"{file}: {len(unknown)} names in its lists of training and test photographs are not among its frames. "
-            f"Mend the lists, or ignore them with --split every.{format_list(unknown)}"
-        )
+        if listed and options.split != "every":
+            found, unknown = find_listed(list(map(str, listed)), names, f"{file}: {key}", strict=options.strict)
+            splits.update(dict.fromkeys(found, side))
+            sides_listed.add(side)
+            notes += unknown
     if len(sides_listed) == 1:
         rest: Split = "train" if "test" in sides_listed else "test"
         return {name: splits.get(name, rest) for name in names}

@@ -20,6 +20,8 @@ from vdgs.errors import CaptureError
 
 #: Bytes that are read at once, and that are looked at to tell what a file is.
 CHUNK_BYTES, HEAD_BYTES = 1 << 20, 4096
+#: What is looked for in files is not longer.
+_OVERLAP_BYTES = 512
 #: Files that are a zip with an XML file in it, which is called so where there are several.
 _ZIPPED, _DOCUMENT = (".xmlz", ".zip", ".psz"), "doc.xml"
 #: Elements lie in no more others than this; text and attributes of one are no longer than this.
@@ -53,15 +55,29 @@ def root_element(file: Path) -> str:
 
 def holds(file: Path, *texts: bytes) -> bool:
     """Whether a file holds all of these texts, wherever; not so where it cannot be read."""
-    missing, kept = set(texts), b""
+    missing = set(texts)
+    for part in _parts(file):
+        missing -= {text for text in missing if text in part}
+        if not missing:
+            return True
+    return False
+
+
+def holds_match(file: Path, pattern: re.Pattern[bytes]) -> bool:
+    """Whether a file holds what a pattern of less than some hundred bytes matches; not so where it cannot be read."""
+    return any(pattern.search(part) for part in _parts(file))
+
+
+def _parts(file: Path) -> Iterator[bytes]:
+    """A file in parts that overlap; none more from where it cannot be read."""
+    kept = b""
     try:
         with _opened(file) as stream:
-            while missing and (block := stream.read(CHUNK_BYTES)):
-                missing -= {text for text in missing if text in kept + block}
-                kept = block[-max(map(len, texts)) :]
+            while block := stream.read(CHUNK_BYTES):
+                yield kept + block
+                kept = block[-_OVERLAP_BYTES:]
     except (OSError, CaptureError):
-        return False
-    return not missing
+        return
 
 
 @contextmanager
