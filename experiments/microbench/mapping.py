@@ -32,9 +32,8 @@ def main() -> None:
     asked = parser.parse_args()
     silence_colmap()
     print(describe())
-    print(
-        "\n| | processor s | photographs of each model | points, seen by | reprojection error px |\n|---|---|---|---|---|"
-    )
+    print("\n| | processor s | photographs of each model | points, seen by | reprojection error px |")
+    print("|---|---|---|---|---|")
     for ratio in asked.ratios:
         with tempfile.TemporaryDirectory(prefix="vdgs-") as folder:
             measure(Workspace(asked.capture / WORK_FOLDER), Workspace(Path(folder)), ratio, not asked.fit_focal)
