@@ -20,9 +20,9 @@ from vdgs.system.processor_time import NO_COST, Cost, Moment, describe_cost
 #: Processor seconds of a machine that searches a megapixel for features in `FEATURE_SECONDS`: of an observation (a
 #: feature that the model holds, in one photograph) mapped, growing with the number of photographs (bundle adjustment
 #: takes all that are placed), of a megapixel written, of georeferencing and figures. Measured: docs/sfm.md.
-FEATURE_SECONDS, MAPPING_SECONDS, WRITING_SECONDS, FIXED_SECONDS = 0.25, 4.2e-5, 0.03, 1.5
+FEATURE_SECONDS, MAPPING_SECONDS, WRITING_SECONDS, FIXED_SECONDS = 0.25, 5.2e-5, 0.03, 1.5
 #: With so many photographs one takes twice as long to be mapped as the first, and what share of mapping is parallel.
-MAPPING_SCALE, PARALLEL_MAPPING = 16, 0.3
+MAPPING_SCALE, PARALLEL_MAPPING = 36, 0.3
 #: A photograph's pairs match as many of its features as so many pairs do that match them by chance, each on its own;
 #: the photographs that observe a point, for the root of those that show its place; and where positions do not tell
 #: these. Measured: 70, 61 and 19 % of the features where a pair matches 20, 18 and 4 %; 4.6 and 2.3 of 17 and 4.5.
