@@ -35,8 +35,9 @@ MIN_POINTS = 30
 #: A part keeps its shape where its cameras move by no more than this share of their distance to what they see, and turn
 #: by no more degrees (RMS and median); smaller parts have little shape to keep (choices).
 MAX_MOVED_SHARE, MAX_TURNED_DEG, MIN_PART = 0.02, 1.0, 5
-#: Its points are seen where they were before, within so many pixels more.
-MAX_WORSE_PX = 0.1
+#: Its points are seen where they were before, within so many pixels more; and all points where they should be within so
+#: many in the mean.
+MAX_WORSE_PX, MAX_ERROR_PX = 0.1, 1.0
 _POLL_SECONDS = 0.2
 
 
@@ -60,8 +61,11 @@ def place_left_out(workspace: Workspace, count: int, fix_focal: bool, threads: i
         incremental_mapper.run_mapper(workspace, count, fix_focal, threads, console)
         joined = incremental_mapper.read_models(workspace)[0]
         _leave_weak_out(joined)
-        if len(placed_images(joined)) > len(placed_images(parts[0])) and all(
-            _keeps_shape(part, joined) for part in parts if part is parts[0] or len(placed_images(part)) >= MIN_PART
+        with_shape = [part for part in parts if len(placed_images(part)) >= MIN_PART]
+        if (
+            len(placed_images(joined)) > len(placed_images(parts[0]))
+            and joined.compute_mean_reprojection_error() <= MAX_ERROR_PX
+            and all(_keeps_shape(part, joined) for part in with_shape)
         ):
             shutil.rmtree(workspace.models)
             write_model_files(joined, workspace.models / "0")
