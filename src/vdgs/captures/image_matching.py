@@ -101,7 +101,7 @@ def _fitted(
 def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:
     """A warning where some photographs are shrunk by another factor than most: thumbnails among the photographs."""
     factors = np.array([photo.file.intrinsics.width / photo.view.intrinsics.width for photo in photographs])
-    usual = float(np.median(factors))
+    usual = float(np.quantile(factors, 0.5, method="higher"))  # one of them, whatever their number
     others = np.flatnonzero(np.abs(factors / usual - 1) > MAX_SIZE_DEVIATION)
     if not len(others):
         return []
