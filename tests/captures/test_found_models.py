@@ -260,6 +260,9 @@ def test_points_come_from_a_cloud_beside_the_model(tmp_path, scene, cloud, text)
     points.unlink()
     with pytest.raises(CaptureError, match=r"no 3D points(?s:.)*points3D\.ply"):
         load_capture(tmp_path)
+    (tmp_path / "photographs").symlink_to(tmp_path / "images")
+    with pytest.raises(CaptureError, match=f"vdgs sfm {tmp_path} --images photographs --output CAPTURE"):
+        load_capture(tmp_path, CaptureOptions(images="photographs"))
     write_ply(tmp_path / cloud, scene.points, scene.colors)
     capture = load_capture(tmp_path)
     assert len(capture.points) == len(scene.points)

@@ -116,7 +116,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
-    points, colors = _points(root, content, file, poses, needs_points, warnings)
+    points, colors = _points(root, content, file, poses, options.images, needs_points, warnings)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
@@ -239,7 +239,13 @@ def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.
 
 
 def _points(
-    root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray], needs_points: bool, notes: list[str]
+    root: Path,
+    content: JsonObject,
+    file: Path,
+    poses: dict[str, np.ndarray],
+    images: str | None,
+    needs_points: bool,
+    notes: list[str],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
@@ -248,7 +254,7 @@ def _points(
         return read_point_cloud(cloud)
     what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
     option = " and give --format transforms"
-    found = find_sparse_points(root, poses, what, option=option, needs_points=needs_points)
+    found = find_sparse_points(root, poses, what, option=option, images=images, needs_points=needs_points)
     if cloud is not None and len(found[0]):
         notes.append(
             f"{cloud}: is not there, though {TRANSFORMS_FILE} names it; {len(found[0]):,} points beside it are used."
