@@ -22,6 +22,7 @@ from vdgs.captures.formats.json_poses import (
     parse_number,
     read_capture_json,
 )
+from vdgs.captures.formats.listed_names import find_listed
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import (
     BadPose,
@@ -36,7 +37,6 @@ from vdgs.captures.formats.source_capture import (
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.image_files import find_images
-from vdgs.captures.listed_names import find_listed
 from vdgs.captures.name_resolution import find_file, find_in_other_folders, largest_shrunk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
