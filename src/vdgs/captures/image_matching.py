@@ -106,10 +106,10 @@ def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:
     if not len(others):
         return []
     names = ", ".join(photographs[index].view.name for index in others[:5]) + (", ..." if len(others) > 5 else "")
-    low, high = factors[others].min(), factors[others].max()
+    sizes = " to ".join(dict.fromkeys(f"{size:.3g}" for size in (factors[others].min(), factors[others].max())))
     return [
-        f"{len(others)} of {len(factors)} photographs are not shrunk as the rest, to {low:.3g} to {high:.3g} of the "
-        f"size of their cameras instead of {usual:.3g} ({names}). Thumbnails?"
+        f"{len(others)} of {len(factors)} photographs are not shrunk as the rest, to {sizes} of the size of "
+        f"their cameras instead of {usual:.3g} ({names}). Thumbnails?"
     ]
 
 

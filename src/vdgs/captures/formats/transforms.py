@@ -249,7 +249,10 @@ def _points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
-    cloud = None if ply is None else root / safe_name(str(ply), file, "ply_file_path", root)
+    try:
+        cloud = None if ply is None else root / safe_name(str(ply), file, "ply_file_path", root)
+    except CaptureError as error:
+        raise CaptureError(f"{error} Or put the point cloud beside it, by the same name.") from error
     if cloud is not None and cloud.is_file():
         return read_point_cloud(cloud)
     what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
