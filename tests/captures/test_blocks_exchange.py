@@ -57,6 +57,16 @@ def test_systems_are_read_exactly(tmp_path, flight, system):
     assert (source.georef.origin is None) == (system is None)
 
 
+@pytest.mark.parametrize(("unit", "said"), [(1.0, "taken as metres"), (1200 / 3937, "x, y and heights in feet")])
+def test_tie_points_tell_the_unit_of_heights_of_a_system_in_feet(tmp_path, flight, unit, said):
+    pytest.importorskip("pyproj")
+    feet = "+proj=utm +zone=32 +datum=WGS84 +units=us-ft +type=crs"
+    source = read(tmp_path, blocks_xml(flight, feet, height_unit=unit), flight)
+    assert_true(source, flight)
+    assert_points(source, flight)
+    assert said in source.georef.method
+
+
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize("angles", [False, True])
 def test_rotations_and_axes(tmp_path, flight, orientation, angles):

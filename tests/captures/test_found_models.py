@@ -161,6 +161,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("metadata.json", '{"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0', "poses of Record3D"),
         ("metadata.json", '{"h": 960, "perFrameIntrinsicCoeffs": [[0, 0, 0, 1]', "poses of Record3D"),
         ("cameras/17.json", '{"t_00": 1.0, "t_01": 0.0, "t_02": 0.0, "fx": 900}', "poses of Polycam"),
+        ("trajectories.txt", "# kapture format: 1.1\n# timestamp, device_id, qw, qx, qy, qz, tx\n", "of Kapture"),
         ("cams/00000000_cam.txt", "extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\nintrinsic\n", "of MVSNet"),
         ("Barn.log", "0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 -2.5e-1\n0 0 0 1\n", "of Tanks and Temples"),
         ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n1.0, 000000, 0, 0", "Stray Scanner; the film"),
@@ -260,6 +261,9 @@ def test_points_come_from_a_cloud_beside_the_model(tmp_path, scene, cloud, text)
     points.unlink()
     with pytest.raises(CaptureError, match=r"no 3D points(?s:.)*points3D\.ply"):
         load_capture(tmp_path)
+    (tmp_path / "photographs").symlink_to(tmp_path / "images")
+    with pytest.raises(CaptureError, match=f"vdgs sfm {tmp_path} --images photographs --output CAPTURE"):
+        load_capture(tmp_path, CaptureOptions(images="photographs"))
     write_ply(tmp_path / cloud, scene.points, scene.colors)
     capture = load_capture(tmp_path)
     assert len(capture.points) == len(scene.points)

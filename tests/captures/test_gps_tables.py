@@ -241,6 +241,7 @@ def test_systems_are_known_by_all_their_names(tmp_path, header, code):
     change, name = to_geodetic("EPSG:2225", tmp_path / "geo.txt")
     assert "heights are taken as metres" in name
     assert change(np.array([[6_000_000.0, 2_000_000, 5]]))[0, 2] == 5
+    assert "heights as they are, for 'CUST:egm96' is" in to_geodetic("EPSG:32719+CUST:egm96", tmp_path)[1]
     assert "30N" in to_geodetic("WGS84 UTM 30U", tmp_path)[1]
     assert to_geodetic("WGS84 longlat", tmp_path)[0](np.array([[7.0, 50, 5]])) == pytest.approx(np.array([[50, 7, 5]]))
 

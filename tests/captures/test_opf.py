@@ -71,6 +71,7 @@ def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) 
         ((None, ["Red edge"]), 8, "4 cameras show other bands (Red edge)"),
         ((["NIR"], ["Red"]), 8, "4 cameras show other bands (Red)"),
         ((["LWIR"], ["LWIR"]), 12, ""),
+        ((["R", "G", "B"], None), 12, ""),
     ],
 )
 def test_cameras_of_opf_of_other_bands_are_named_and_left_out(tmp_path, flight, bands, used, said):

@@ -299,8 +299,12 @@ def test_paths_of_another_machine_are_those_of_the_captures_files(tmp_path, scen
 
 def test_a_path_outside_the_capture_is_called_what_it_is(tmp_path, scene):
     write_transforms(tmp_path, scene, ply_file_path="/elsewhere/cloud.ply")
-    with pytest.raises(CaptureError, match=r"the ply_file_path '/elsewhere/cloud\.ply' is not a path inside"):
+    with pytest.raises(
+        CaptureError, match=r"the ply_file_path '/elsewhere/cloud\.ply' is not a path .* beside it, by the same name"
+    ):
         load_capture(tmp_path)
+    (tmp_path / "sparse_pc.ply").rename(tmp_path / "cloud.ply")
+    assert len(load_capture(tmp_path).points) == len(scene.points)
 
 
 def test_single_poses_that_are_none_are_left_out_and_masks_of_instant_ngp_are_turned_round(tmp_path, scene):

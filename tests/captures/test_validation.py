@@ -289,6 +289,12 @@ def test_sizes_that_do_not_fit_the_rest(folder, scene):
     names = list(scene.cameras)
     cv2.imwrite(str(folder / "images" / names[3]), np.zeros((12, 16, 3), np.uint8))
     assert any("not shrunk as the rest" in each and names[3] in each for each in load_capture(folder).warnings)
+    for name in names[::2]:
+        cv2.imwrite(str(folder / "images" / name), np.zeros((24, 32, 3), np.uint8))
+    cv2.imwrite(str(folder / "images" / names[3]), np.zeros((48, 64, 3), np.uint8))
+    [said] = [each for each in load_capture(folder).warnings if "not shrunk as the rest" in each]
+    assert said.startswith("6 of 12 photographs")
+    assert "to 0.5 of the size of their cameras instead of 1 " in said
     cv2.imwrite(str(folder / "images" / names[3]), np.zeros((1, 1, 3), np.uint8))
     with pytest.raises(CaptureError, match=rf"{names[3]}: is 1x1 pixels, too small"):
         load_capture(folder)

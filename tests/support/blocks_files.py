@@ -22,9 +22,9 @@ ORIENTATIONS = {
 }
 
 
-def in_system(flight: TrueFlight, code: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations, centres and points in a projected or geographic system: each place by itself, each rotation about the
-    axes that the system has there (east and north of the grid, up)."""
+def in_system(flight: TrueFlight, code: str, height_unit: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations, centres and points in a projected or geographic system: each place by itself, heights in a unit of so
+    many metres, each rotation about the axes that the system has there (east and north of the grid, up)."""
     import pyproj
 
     crs = pyproj.CRS(code)
@@ -32,7 +32,7 @@ def in_system(flight: TrueFlight, code: str) -> tuple[np.ndarray, np.ndarray, np
 
     def moved(points: np.ndarray) -> np.ndarray:
         geodetic = geodetic_from_enu(points, ORIGIN)
-        return np.column_stack([*change.transform(geodetic[:, 1], geodetic[:, 0]), geodetic[:, 2]])
+        return np.column_stack([*change.transform(geodetic[:, 1], geodetic[:, 0]), geodetic[:, 2] / height_unit])
 
     rotations = []
     for rotation, place in zip(flight.rotations, geodetic_from_enu(flight.centers, ORIGIN), strict=True):
@@ -52,13 +52,13 @@ def tags(names: Iterable[str], values: Iterable[float]) -> str:
 def blocks_xml(
     flight: TrueFlight, system: str | None = "EPSG:32632", *, angles: bool | str = False,
     orientation: str = "XRightYDown", in_millimeters: bool = False, tie_points: bool = True,
-    paths: Sequence[str] | None = None, more: str = "", rolls: str = "clockwise",
+    paths: Sequence[str] | None = None, more: str = "", rolls: str = "clockwise", height_unit: float = 1.0,
 ) -> str:  # fmt: skip
     """A block, version 2.1; `system` None or of the kind ENU: metres as the flight has them. Of
     `angles` those called "roll" are Yaw, Pitch and Roll, which `rolls` cameras so, seen from behind."""
-    mapped = system is not None and system.startswith("EPSG")
+    mapped = system is not None and system.startswith(("EPSG", "+proj"))
     rotations, centers, points = (
-        in_system(flight, str(system)) if mapped else (flight.rotations, flight.centers, flight.points)
+        in_system(flight, str(system), height_unit) if mapped else (flight.rotations, flight.centers, flight.points)
     )
     paths = paths or [f"D:\\flights\\{name}".replace("/", "\\") for name in flight.names]
     photos = []

@@ -23,6 +23,8 @@ _STARTS = re.compile(
 )  # fmt: skip
 #: Codes in whatever stands around them: `EPSG:32633+5773`, `EPSG=32633`, `UTM zone 33N (EPSG::32633)`, addresses.
 _CODES = re.compile(r"(?:EPSG|SRID)(?:\.io/|\.xml#|[\s:=_-]{0,3})(\d{4,6}(?:\+\d{4,6})?)(?!\d|\.)", re.I)
+#: What stands for a system of heights beside a code, and is no code.
+_UNKNOWN_HEIGHTS = re.compile(r"(?:EPSG|SRID)[\s:=_-]{0,3}\d{4,6}\+(?!\d)([^\s,;]+)$", re.I)
 _WKT = re.compile(r"\w*(CS|CRS)\[", re.I)
 #: A line that may be a name alone: no table of words, no numbers on their own.
 _WORDS = re.compile(r"(?!.*(^|\s)[\d.]+\s+[\d.])[A-Za-z][^,;\t]{2,60}")
@@ -129,6 +131,8 @@ def to_geodetic(
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
         name += "; heights as they are, for PROJ lacks the grid of their geoid"
+    if heights := _UNKNOWN_HEIGHTS.match(header.strip(_AROUND)):
+        name += f"; heights as they are, for {heights[1]!r} is not known"
     unknown = crs.datum is not None and not _says_its_shift(crs) and crs.datum.name.lower().startswith("unknown")
     ellipsoid = crs.ellipsoid.name if unknown and crs.ellipsoid is not None else "WGS 84"
     if ellipsoid not in _GLOBAL:

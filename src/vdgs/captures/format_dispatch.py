@@ -169,7 +169,7 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
             warnings.append(f"the model holds no points; those of {cloud.relative_to(root)} are used.")
         elif needs_points:
             raise no_points(
-                root, f"{folder}: the model holds",
+                root, options.images, f"{folder}: the model holds",
                 "Or keep points3D.bin beside images.bin, or put a point cloud in the same world there as "
                 f"{POINT_CLOUDS[0]}.",
             )  # fmt: skip

@@ -101,15 +101,15 @@ def _fitted(
 def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:
     """A warning where some photographs are shrunk by another factor than most: thumbnails among the photographs."""
     factors = np.array([photo.file.intrinsics.width / photo.view.intrinsics.width for photo in photographs])
-    usual = float(np.median(factors))
+    usual = float(np.quantile(factors, 0.5, method="higher"))  # one of them, whatever their number
     others = np.flatnonzero(np.abs(factors / usual - 1) > MAX_SIZE_DEVIATION)
     if not len(others):
         return []
     names = ", ".join(photographs[index].view.name for index in others[:5]) + (", ..." if len(others) > 5 else "")
-    low, high = factors[others].min(), factors[others].max()
+    sizes = " to ".join(dict.fromkeys(f"{size:.3g}" for size in (factors[others].min(), factors[others].max())))
     return [
-        f"{len(others)} of {len(factors)} photographs are not shrunk as the rest, to {low:.3g} to {high:.3g} of the "
-        f"size of their cameras instead of {usual:.3g} ({names}). Thumbnails?"
+        f"{len(others)} of {len(factors)} photographs are not shrunk as the rest, to {sizes} of the size of "
+        f"their cameras instead of {usual:.3g} ({names}). Thumbnails?"
     ]
 
 

@@ -27,6 +27,7 @@ _REALITYSCAN = (
     "a project of RealityScan; what it exports (Registration: Internal/External camera parameters, CSV, with the "
     "sparse point cloud as PLY) is read"
 )
+_KAPTURE = "poses of Kapture; kapture_export_colmap.py makes a COLMAP model, which is read"
 _POLYCAM = "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
 _RECORD3D = "poses of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of them, which is read"
 _AS_OTHERS = "a BlocksExchange, OPF or Agisoft XML file of the same project is read"
@@ -52,7 +53,7 @@ _OTHERS = {
     "*.mg": "a project of Meshroom; cameras.sfm of its step StructureFromMotion is read",
     "sfm.abc": "poses of Meshroom in Alembic; cameras.sfm beside it, or the .sfm of its step ConvertSfMFormat, is read",
     "Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
-    "sensors/trajectories.txt": "poses of Kapture; kapture_export_colmap.py makes a COLMAP model, which is read",
+    "sensors/trajectories.txt": _KAPTURE,
     "*.mvs": "a scene of OpenMVS; the COLMAP or OpenMVG model that it was made of is read",
     "keyframes/*cameras/*.json": _POLYCAM,
     "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
@@ -86,6 +87,7 @@ _BY_CONTENT = (
         ".txt", rb"photoid, x, y, z, omega",
         "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",
     ),
+    (".txt", rb"\A# *kapture format", _KAPTURE),
     (".txt", rb"\A\s*extrinsic\s", "cameras of MVSNet; the COLMAP model that they were made of is read"),
     (
         ".log", rb"\A\s*\d+ +\d+ +\d+\s*\n(\s*[-+.\de]+){16}\s",

@@ -18,7 +18,7 @@ import numpy as np
 from vdgs.captures.capture import Split, View
 from vdgs.captures.flight_parts import MIN_STRIP, OBLIQUE_DEGREES, flight_strips, oblique_views
 from vdgs.captures.formats.colmap import find_models
-from vdgs.captures.listed_names import find_listed
+from vdgs.captures.formats.listed_names import find_listed
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 

@@ -36,7 +36,7 @@ class CaptureOptions:
     test_every: Annotated[int, Range(2, MAX_COUNT)] = 8
     """Every n-th photograph in name order is kept for testing. Those are 0, n, 2n and so on, as in 3DGS (llffhold)."""
     test_list: Path | None = None
-    """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
+    """Text file with the names of the test photographs, one a line. Default: test.txt of the capture, if any."""
     split: SplitMode = "auto"
     """How photographs are kept for testing. auto: the capture's own split or test list where there is one, else every
     n-th (where transforms.json lists training and test photographs, those in neither list are left out); explicit:

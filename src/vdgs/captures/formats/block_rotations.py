@@ -1,7 +1,6 @@
-"""Rotations of BlocksExchange, and which way its Roll turns.
+"""Rotations of BlocksExchange, and what tie points tell where a file may be read in two ways.
 
-Bentley's description of Yaw, Pitch and Roll leaves open from which end of the axis a roll is seen, and programs differ:
-the tie points of the file decide.
+Bentley's description of Yaw, Pitch and Roll leaves open from which end of the axis a roll is seen, and programs differ.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from vdgs.errors import CaptureError
 
 #: Rolls in degrees that are none.
 _LEVEL_DEG = 1e-3
-#: Tie points agree with a roll where the median of their reprojection errors is at most this many pixels (choice).
+#: Tie points agree with a way where the median of their reprojection errors is at most this many pixels (choice).
 _AGREES_PX = 3.0
 ASK_FOR_MATRIX = "which programs mean in different ways: export it as a matrix, or as Omega, Phi, Kappa"
 
 
-class Rolled(NamedTuple):
-    """A photograph whose roll is not clear: its pose with the roll turned one way and the other, and what it shows."""
+class TwoWays(NamedTuple):
+    """A photograph that may be read in two ways: its pose and the points that it shows in each, and where."""
 
     intrinsics: Intrinsics
     poses: tuple[np.ndarray, np.ndarray]
-    points: np.ndarray
+    points: tuple[np.ndarray, np.ndarray]
     pixels: np.ndarray
 
 
@@ -59,13 +58,13 @@ def block_rotation(element: Element, file: Path, roll: int = 1) -> np.ndarray:
     raise CaptureError(f"the rotation is given by {kinds}, {ASK_FOR_MATRIX}")
 
 
-def told_by_points(rolled: Iterable[Rolled]) -> tuple[int | None, list[float]]:
-    """Which pose of each photograph its tie points agree with, or None, and their median reprojection errors."""
+def told_by_points(photographs: Iterable[TwoWays]) -> tuple[int | None, list[float]]:
+    """Which way the tie points of photographs agree with, or None, and their median reprojection errors."""
     errors: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for photo in rolled:
+    for photo in photographs:
         seen = pixel_rays(photo.intrinsics, photo.pixels)
-        for pose, found in zip(photo.poses, errors, strict=True):
-            across = photo.points @ pose[:3, :3].T + pose[:3, 3]
+        for pose, points, found in zip(photo.poses, photo.points, errors, strict=True):
+            across = points @ pose[:3, :3].T + pose[:3, 3]
             with np.errstate(divide="ignore", invalid="ignore"):
                 gap = np.hypot(*((across[:, :2] / across[:, 2:] - seen) * photo.intrinsics.focal).T)
             found.append(np.where(across[:, 2] > 0, gap, np.inf)[np.isfinite(seen).all(axis=1)])

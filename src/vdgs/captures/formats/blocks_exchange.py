@@ -17,8 +17,15 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_in_degrees, is_local_system, to_geodetic
-from vdgs.captures.formats.block_rotations import ASK_FOR_MATRIX, Rolled, block_rotation, has_roll, told_by_points
+from vdgs.captures.coordinate_systems import (
+    ToGeodetic,
+    UnknownSystem,
+    is_in_degrees,
+    is_local_system,
+    to_geodetic,
+    unit_without_heights,
+)
+from vdgs.captures.formats.block_rotations import ASK_FOR_MATRIX, TwoWays, block_rotation, has_roll, told_by_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fisheye
 from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
@@ -186,8 +193,8 @@ class _Block:
         points = np.array(self._points).reshape(-1, 3)
         rolled = {number: photo for number, photo in self._photos.items() if photo.other_roll is not None}
         way, errors = told_by_points(
-            Rolled(photo.intrinsics, (photo.pose, photo.other_roll), points[photo.sightings[0]],  # type: ignore[arg-type]
-                   np.reshape(photo.sightings[1], (-1, 2)))
+            TwoWays(photo.intrinsics, (photo.pose, photo.other_roll), (points[photo.sightings[0]],) * 2,  # type: ignore[arg-type]
+                    np.reshape(photo.sightings[1], (-1, 2)))
             for photo in rolled.values()
         )  # fmt: skip
         for number, photo in rolled.items():
@@ -331,6 +338,8 @@ class _Block:
             return self._enu(definition)
         try:
             geodetic, name = to_geodetic(definition, self._file, "its SRS")
+            if self._has_heights_as_xy(unit_without_heights(definition)):
+                geodetic, name = to_geodetic(definition, self._file, "its SRS", heights_as_xy=True)
         except UnknownSystem:
             if self._seems_degrees():
                 raise
@@ -341,6 +350,20 @@ class _Block:
         if origin is not None:
             frames = ((f"of {name}, about SRSOrigin", lambda points: geodetic(points + origin)),)
         return geodetic, is_in_degrees(definition), f"BlocksExchange, {name}", frames
+
+    def _has_heights_as_xy(self, unit: float) -> bool:
+        """Whether tie points tell that z is in the `unit` (metres) of x and y, and not in metres."""
+        if unit == 1:
+            return False
+        to_meters, points = np.array([unit, unit, 1.0]), np.array(self._points).reshape(-1, 3)
+        ways = []
+        for photo in self._photos.values():
+            in_meters, shown = photo.pose.copy(), points[photo.sightings[0]]
+            turn, center = photo.pose[:3, :3], -photo.pose[:3, :3].T @ photo.pose[:3, 3]
+            in_meters[:3, 3] = -turn @ (center * to_meters)
+            pixels = np.reshape(photo.sightings[1], (-1, 2))
+            ways.append(TwoWays(photo.intrinsics, (in_meters, photo.pose), (shown * to_meters, shown), pixels))
+        return told_by_points(ways)[0] == 1
 
     def _seems_degrees(self) -> bool:
         poses = np.array([photo.pose for photo in self._photos.values()]).reshape(-1, 4, 4)

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 
 from vdgs.system.units import first_names
 
-#: What programs call the bands of color photographs, in lower case: one name for all, or these three among others.
-_COLOR, _COLORS = {"visible", "rgb", "color"}, {"red", "green", "blue"}
+#: What programs call the bands of color photographs, in lower case: one name for all, or three among others.
+_COLOR, _COLORS = {"visible", "rgb", "color"}, ({"red", "green", "blue"}, {"r", "g", "b"})
 
 
 def color_cameras(cameras: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[list[bool], list[str]]:
     """Which cameras are used, and a warning about the others, of names and the bands that each shows (none where the
     project does not say). All in color are; where none is, those of the bands that most have."""
     bands = [frozenset(band.strip().lower() for band in shown) for _, shown in cameras]
-    used = [not shown or bool(shown & _COLOR) or shown >= _COLORS for shown in bands]
+    used = [not shown or bool(shown & _COLOR) or any(shown >= colors for colors in _COLORS) for shown in bands]
     if not any(used) and bands:
         usual = Counter(bands).most_common(1)[0][0]
         used = [shown == usual for shown in bands]

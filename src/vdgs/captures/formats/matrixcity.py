@@ -99,7 +99,7 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
     what = "MatrixCity's layout" if is_city else files[0][0].name
-    points, colors = find_sparse_points(root, poses, what, needs_points=needs_points)
+    points, colors = find_sparse_points(root, poses, what, images=options.images, needs_points=needs_points)
     world = WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
     if is_city:
         unit = scales.pop()

@@ -65,7 +65,7 @@ def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = Tru
         ) from None
     poses = {view.name: view.camera_from_world for view in views}
     points, colors = find_sparse_points(
-        root, poses, "Mega-NeRF's layout", _aliases(root, views), needs_points=needs_points
+        root, poses, "Mega-NeRF's layout", _aliases(root, views), images=options.images, needs_points=needs_points
     )
     world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)

@@ -22,14 +22,13 @@ from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import find_photographs
-from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView
+from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView, points_command
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import sample_points
-from vdgs.system.quoting import shell_word
 
 #: A cloud belongs to the cameras if this share of its points fall into photographs (choice).
 LEAST_SEEN, POINTS_LOOKED_AT = 0.3, 2000
@@ -102,7 +101,7 @@ def project_capture(
     poses = world.moved_poses([view.camera_from_world for view in project.views])
     points, colors, warnings = world.moved(project.points), project.colors, [*project.warnings, *lost, *found.warnings]
     if not len(points) and needs_points:
-        points, colors, note = _cloud_beside(project, root, poses, world)
+        points, colors, note = _cloud_beside(project, root, options.images, poses, world)
         warnings.append(note)
     views = tuple(
         SourceView(
@@ -204,9 +203,10 @@ def _world_of(project: Project) -> _World:
 
 
 def _cloud_beside(
-    project: Project, root: Path, poses: Sequence[np.ndarray], world: _World
+    project: Project, root: Path, images: str | None, poses: Sequence[np.ndarray], world: _World
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points and colors of a PLY, LAS or LAZ beside a project that its cameras see, in the world, and a note on it."""
+    find_points = points_command(project.file if project.file.parent == root else root, images)
     cloud = find_point_cloud(root, project.file.parent, lone=True)
     las = find_las((root, project.file.parent, *(folder for each in _DENSE for folder in sorted(root.glob(each)))))
     if cloud is None and can_read_las():
@@ -217,8 +217,8 @@ def _cloud_beside(
             more += f" Several are there ({', '.join(several[:3])}): call the one that is meant {POINT_CLOUDS[0]}."
         raise NoTiePoints(
             f"{project.file}: brings poses but no 3D points, from which the scene starts. This finds them, with the "
-            f"poses as they are: vdgs sfm {shell_word(_given(project, root))} --output CAPTURE\nOr put a point cloud "
-            f"in the same coordinates beside it, as a PLY, LAS or LAZ file.{more}"
+            f"poses as they are: {find_points}\nOr put a point cloud in the same coordinates beside it, as a PLY, LAS "
+            f"or LAZ file.{more}"
         )
     points, colors = (read_point_cloud if cloud.suffix.lower() == ".ply" else read_las_points)(cloud)
     frames: list[CloudFrame] = [("of the project", world.moved)]
@@ -234,14 +234,9 @@ def _cloud_beside(
         raise NoTiePoints(
             f"{cloud}: its points are not where the cameras of {project.file.name} look ({seen:.0%} fall into "
             "photographs, at best): it is in other coordinates, or of another project. Export it in the project's own, "
-            f"or move it away and find points anew: vdgs sfm {shell_word(_given(project, root))} --output CAPTURE"
+            f"or move it away and find points anew: {find_points}"
         )
     return best, colors, f"the project has no points; those of {cloud.name} are used (coordinates {what})."
-
-
-def _given(project: Project, root: Path) -> Path:
-    """What a command takes for a project: the file, or the folder that it lies below."""
-    return project.file if project.file.parent == root else root
 
 
 def _after(change: Callable[[np.ndarray], np.ndarray], world: _World) -> Callable[[np.ndarray], np.ndarray]:

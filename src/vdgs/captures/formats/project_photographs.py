@@ -14,7 +14,6 @@ from vdgs.captures.name_resolution import to_nfc, without_uri
 from vdgs.captures.strays import is_mask_folder, walk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.system.quoting import shell_word
 
 #: The folder of undistorted photographs, which are not those of a camera.
 UNDISTORTED = "undistorted"
@@ -57,8 +56,8 @@ def find_photographs(
         wanted = ", ".join(each[0] for each in names[:3]) + (", ..." if len(names) > 3 else "")
         have = f"holds {len(images)} others ({', '.join(list(images)[:3])}, ...)" if images else "holds no photographs"
         raise CaptureError(
-            f"{file}: none of its {len(names)} photographs is in {folder}, which {have}. It names {wanted}. Say where "
-            f"they are: vdgs run {shell_word(file)} --images FOLDER --output RUN"
+            f"{file}: none of its {len(names)} photographs is in {folder}, which {have}. It names {wanted}. Say which "
+            "folder they are in: --images FOLDER"
         )
     twice = sorted(name for name, count in Counter(filter(None, found)).items() if count > 1)
     if twice:

@@ -223,12 +223,18 @@ def say_of_panoramas(lens: str) -> str:
     return " Panoramas of 360° are read without a model: vdgs sfm IMAGES --output CAPTURE" if is_panorama else ""
 
 
-def no_points(root: Path, what: str, other: str) -> NoTiePoints:
+def no_points(root: Path, images: str | None, what: str, other: str) -> NoTiePoints:
     """The error of a capture whose poses come without points: what finds them, and what else to do."""
     return NoTiePoints(
-        f"{what} no 3D points, from which the scene starts. This finds them, with the poses as they are: vdgs sfm "
-        f"{shell_word(root)} --output CAPTURE\n{other}"
+        f"{what} no 3D points, from which the scene starts. This finds them, with the poses as they are: "
+        f"{points_command(root, images)}\n{other}"
     )
+
+
+def points_command(path: Path, images: str | None) -> str:
+    """What finds points for poses, of photographs in the folder that `--images` names."""
+    where = "" if images is None else f" --images {shell_word(images)}"
+    return f"vdgs sfm {shell_word(path)}{where} --output CAPTURE"
 
 
 def find_image(root: Path, name: str) -> Path | None:

@@ -30,6 +30,7 @@ def find_sparse_points(
     aliases: Mapping[str, str] | None = None,
     option: str = "",
     *,
+    images: str | None = None,
     needs_points: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colors [n, 3]
@@ -38,8 +39,8 @@ def find_sparse_points(
     Taken from a PLY file in that world, else from a COLMAP model of the same photographs, which may live
     in any world: it is brought over by the similarity between the camera centers that both have. `aliases`
     maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
-    that its cameras do not replace `poses`. Raises `NoTiePoints` if there is nothing, unless nothing
-    `needs_points`, and `CaptureError` if there is nothing that fits.
+    that its cameras do not replace `poses`; `images` is the folder that `--images` names. Raises `NoTiePoints` if
+    there is nothing, unless nothing `needs_points`, and `CaptureError` if there is nothing that fits.
     """
     cloud = find_point_cloud(root)
     if cloud is not None:
@@ -52,7 +53,7 @@ def find_sparse_points(
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not models:
         raise no_points(
-            root, f"{root}: {what} brings",
+            root, images, f"{root}: {what} brings",
             f"Or put a point cloud in the same world there as {POINT_CLOUDS[0]}, or a COLMAP model of the same "
             f"photographs as sparse/0 (colmap feature_extractor, exhaustive_matcher, then mapper or "
             f"point_triangulator){option}.",

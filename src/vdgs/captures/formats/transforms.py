@@ -22,6 +22,7 @@ from vdgs.captures.formats.json_poses import (
     parse_number,
     read_capture_json,
 )
+from vdgs.captures.formats.listed_names import find_listed
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import (
     BadPose,
@@ -36,7 +37,6 @@ from vdgs.captures.formats.source_capture import (
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.image_files import find_images
-from vdgs.captures.listed_names import find_listed
 from vdgs.captures.name_resolution import find_file, find_in_other_folders, largest_shrunk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -116,7 +116,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
-    points, colors = _points(root, content, file, poses, needs_points, warnings)
+    points, colors = _points(root, content, file, poses, options.images, needs_points, warnings)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
@@ -239,16 +239,25 @@ def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.
 
 
 def _points(
-    root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray], needs_points: bool, notes: list[str]
+    root: Path,
+    content: JsonObject,
+    file: Path,
+    poses: dict[str, np.ndarray],
+    images: str | None,
+    needs_points: bool,
+    notes: list[str],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
-    cloud = None if ply is None else root / safe_name(str(ply), file, "ply_file_path", root)
+    try:
+        cloud = None if ply is None else root / safe_name(str(ply), file, "ply_file_path", root)
+    except CaptureError as error:
+        raise CaptureError(f"{error} Or put the point cloud beside it, by the same name.") from error
     if cloud is not None and cloud.is_file():
         return read_point_cloud(cloud)
     what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
     option = " and give --format transforms"
-    found = find_sparse_points(root, poses, what, option=option, needs_points=needs_points)
+    found = find_sparse_points(root, poses, what, option=option, images=images, needs_points=needs_points)
     if cloud is not None and len(found[0]):
         notes.append(
             f"{cloud}: is not there, though {TRANSFORMS_FILE} names it; {len(found[0]):,} points beside it are used."
