@@ -254,6 +254,11 @@ def test_transforms_without_points_keep_their_poses_and_lists(
     np.testing.assert_allclose(poses, flight.poses[:6], atol=1e-9)
     every = read_posed_photographs(request, CaptureOptions(split="every"))
     assert len(every.trained) == 7
+    (tmp_path / "set" / "test.txt").write_text(f"{flight.names[1]}\n{flight.names[2]}\n")
+    (tmp_path / "set" / "validation.txt").write_text(f"{flight.names[4]}\n")
+    own = read_posed_photographs(request, CaptureOptions())
+    assert [own.views[k].view.name for k in own.trained] == [flight.names[k] for k in (0, 3, 5, 6)]
+    assert own.validation == {flight.names[4]}
 
 
 @pytest.mark.usefixtures("few_features")

@@ -78,6 +78,19 @@ def assign_splits(
     return chosen
 
 
+def held_out_by_capture(
+    root: Path, names: Sequence[str], options: CaptureOptions, warnings: list[str]
+) -> dict[str, set[str]]:
+    """The photographs that a capture's own lists keep from training, by the names of the lists."""
+    found = dict[str, set[str]]()
+    for name in (TEST_LIST, VALIDATION_LIST):
+        file = _list_of(root, name)
+        if file is not None and options.split != "every":
+            found[name], notes = listed_photographs(file, names, some=name == TEST_LIST, strict=options.strict)
+            warnings += notes
+    return found
+
+
 def _list_of(root: Path, name: str) -> Path | None:
     """A list that a capture brings: in its folder, or beside its COLMAP model."""
     files = (folder / name for folder in (root, *find_models(root)))

@@ -25,7 +25,7 @@ from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
 from vdgs.captures.output_guard import check_output
 from vdgs.captures.reconstruction import STEPS_FILE, WORK_FOLDER
-from vdgs.captures.splits import TEST_LIST
+from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.captures.up_axis import estimate_up
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import check_ranges
@@ -94,7 +94,7 @@ def make_posed_capture(
         if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
             for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
                 shutil.rmtree(output / name, ignore_errors=True)
-            for name in ("georef.json", TEST_LIST):
+            for name in ("georef.json", TEST_LIST, VALIDATION_LIST):
                 (output / name).unlink(missing_ok=True)
             finished.begin(CAPTURE, photographs.keys[CAPTURE])
         _write(photographs, work, model, request, threads, console)
@@ -336,9 +336,11 @@ def _write(
         write_json(
             output / "georef.json", {"frame": frame, **place, "method": georef.method, "accuracy": georef.accuracy}
         )
-    tests = [capture_writer.jpeg_name(view.view.name) for view in photographs.views if view.view.split == "test"]
-    if tests:
-        write_text(output / TEST_LIST, "\n".join(tests) + "\n")
+    kept_out = {view.view.name for view in photographs.views if view.view.split == "test"}
+    lists = {TEST_LIST: kept_out - photographs.validation, VALIDATION_LIST: kept_out & photographs.validation}
+    for file, names_of_list in lists.items():
+        if names_of_list:
+            write_text(output / file, "".join(f"{capture_writer.jpeg_name(name)}\n" for name in sorted(names_of_list)))
     shutil.rmtree(output / "sparse", ignore_errors=True)
     capture_writer.write_model(output, model, lenses, lens_of)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from PIL import Image
 
+from vdgs.captures.capture import Split
 from vdgs.captures.capture_root import capture_root
 from vdgs.captures.format_dispatch import READERS, read_source
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
@@ -16,6 +17,7 @@ from vdgs.captures.georeference import Georef
 from vdgs.captures.image_files import pillow_without_limits, read_header
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.image_tags import kind_of
+from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST, held_out_by_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError
@@ -39,6 +41,8 @@ class PosedPhotographs:
     warnings: tuple[str, ...]
     on_white: bool = False
     """Whether what is transparent becomes white; else it is masked."""
+    validation: frozenset[str] = frozenset()
+    """Those that are kept for testing with `--validation` alone."""
 
     @property
     def is_data_set(self) -> bool:
@@ -72,7 +76,8 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
     root, warnings = capture_root(path), list[str]()
     source = _in_metres(read_source(path, options, needs_points=False))
     views, _ = match_images(root, source, options, warnings)
-    views = sorted(_listed(views, options, warnings), key=lambda view: view.view.name)
+    lists = held_out_by_capture(root, [view.view.name for view in views], options, warnings)
+    views = sorted(_listed(views, lists, options, warnings), key=lambda view: view.view.name)
     if sum(view.view.split != "test" for view in views) < 3:
         raise CaptureError(f"{path}: {len(views)} photographs with a pose are there; points need 3 at the very least.")
     on_white = source.source == "matrixcity" and source.georef is None  # not the city: sets of Blender
@@ -83,7 +88,7 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
     return PosedPhotographs(
         source=source, views=tuple(views), pinholes=_pinholes([view.file.intrinsics for view in views]),
         keys=_keys(request, source, views), warnings=(*source.warnings, *warnings),
-        on_white=bool(on_white and transparent),
+        on_white=bool(on_white and transparent), validation=frozenset(lists.get(VALIDATION_LIST, ())),
     )  # fmt: skip
 
 
@@ -114,17 +119,28 @@ def _in_metres(source: SourceCapture) -> SourceCapture:
     return replace(source, views=tuple(moved), world=None, georef=Georef(None, "", world.how))
 
 
-def _listed(views: list[MatchedView], options: CaptureOptions, warnings: list[str]) -> list[MatchedView]:
-    """Without photographs that stand in none of a data set's lists, as where it has points."""
+def _listed(
+    views: list[MatchedView], lists: Mapping[str, set[str]], options: CaptureOptions, warnings: list[str]
+) -> list[MatchedView]:
+    """With the splits of the capture's own lists, else without photographs that stand in none of a data set's, as where
+    it has points. What is kept for validation trains neither."""
+    tests = lists.get(TEST_LIST)
+    if tests is not None:
+        views = [_with_split(view, "test" if view.view.name in tests else "train") for view in views]
     kept = [view for view in views if view.view.split is not None]
     if not kept or options.split == "every":
-        return [MatchedView(replace(view.view, split=None), view.file) for view in views]
+        kept = [_with_split(view, None) for view in views]
     if len(kept) < len(views):
         warnings.append(
             f"{len(views) - len(kept)} of {len(views)} photographs stand in none of the lists of training and test "
             "photographs and are left out. --split every uses them all."
         )
-    return kept
+    validation = lists.get(VALIDATION_LIST, set())
+    return [_with_split(view, "test") if view.view.name in validation else view for view in kept]
+
+
+def _with_split(view: MatchedView, split: Split | None) -> MatchedView:
+    return MatchedView(replace(view.view, split=split), view.file)
 
 
 def _has_alpha(view: MatchedView) -> bool:
