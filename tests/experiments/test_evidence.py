@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from vdgs.config.method import MethodConfig
 from vdgs.config.presets import PRESETS
 from vdgs.config.serialization import diff_settings, to_dict
 
-PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
+ROOT = Path(__file__).parents[2]
+PAGE, REPORTS = ROOT / "docs" / "paper.md", ROOT / "experiments" / "reports"
 #: What a row may say that has no table.
 WITHOUT_TABLE = ("not measured", "without a kept table", "**test views**, before this rule")
 
@@ -78,3 +80,12 @@ def test_a_table_of_test_views_is_found() -> None:
     assert is_of_validation_views((tables / "choices.md").read_text(encoding="utf-8"))
     assert not is_of_validation_views((tables / "few.md").read_text(encoding="utf-8"))
     assert not is_of_validation_views("## Test views, raw\n\n    vdgs bench choices --validation")
+
+
+@pytest.mark.parametrize("analysis", sorted((REPORTS / "analyses").glob("*.py")), ids=lambda file: file.stem)
+def test_analyses_that_are_here_can_be_imported(analysis):
+    """Pages give commands of them; those that a change of the package would break go, with the commit that has them."""
+    for package in ("rasterio", "pycolmap"):
+        if f"import {package}" in analysis.read_text(encoding="utf-8"):
+            pytest.importorskip(package)
+    assert import_module(f"experiments.reports.analyses.{analysis.stem}").main

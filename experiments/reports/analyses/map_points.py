@@ -20,8 +20,8 @@ import pycolmap
 import rasterio
 
 from vdgs.captures.loading import load_capture
-from vdgs.placing.placement import Placement
-from vdgs.settings.capture import CaptureOptions
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.geometry.map_projection import MapProjection
 
 HELD, FOLDER = "held_out.npy", Path("sparse/0")
 LEAST_TRACK, MOST_ERROR_PX = 3, 1.0
@@ -67,14 +67,14 @@ def compare(folder: Path, maps: Path) -> None:
         heights, inverse, nothing = file.read(1).astype(np.float64), ~file.transform, file.nodata
     with rasterio.open(maps / "visibility.tif") as file:
         seen = file.read(1)
-    places = Placement.of(capture.ground, crs).places(ground)
+    places = MapProjection.of(capture.ground, crs).project(ground)
     column, row = (np.floor(each).astype(int) for each in inverse * (places[:, 0], places[:, 1]))
     inside = (column >= 0) & (row >= 0) & (column < heights.shape[1]) & (row < heights.shape[0])
     column, row, places = column[inside], row[inside], places[inside]
     found, v = heights[row, column], seen[row, column]
     centres = np.array([view.camera.position for view in capture.train_views])
     flying = float(np.median(centres[:, 2]) - np.median(capture.points[:, 2]))
-    flying *= Placement.of(capture.ground, crs).similarity_at(ground.mean(0)).scale
+    flying *= MapProjection.of(capture.ground, crs).similarity_at(ground.mean(0)).scale
     print(f"{len(places):,} points on the map, flying height {flying:.1f} {said['unit']}")
     for least in (1, 3, 5, 10):
         kept = (found != nothing) & (v >= least)

@@ -2,7 +2,7 @@
 
     vdgs synth town --size toy --truth --seed 0
     vdgs run town --output run --preset laptop
-    vdgs map run --crs source --output maps
+    vdgs ortho run --crs source --output maps
     python -m experiments.reports.analyses.map_truth town maps
 
 The town is built again from the options in its capture.md; its world is that of the capture (`--crs source`).
@@ -20,12 +20,11 @@ import numpy as np
 import rasterio
 
 from vdgs.captures.loading import load_capture
-from vdgs.settings.capture import CaptureOptions
-from vdgs.synth.lighting import sky_map, tone_map
-from vdgs.synth.photography import sample_offsets
-from vdgs.synth.shading import radiance
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.synth.image_renderer import pixel_sample_offsets, radiance
+from vdgs.synth.lighting import make_sky_map, tone_map
+from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.town import build_town
-from vdgs.synth.tracing import Tracer
 
 #: From how high rays start, and samples per pixel.
 SKY_M, SAMPLES = 300.0, 4
@@ -35,7 +34,7 @@ def main(town_folder: Path, maps: Path) -> None:
     drawn_in = json.loads((maps / "map.json").read_text(encoding="utf-8"))["crs"]
     if drawn_in != "source":
         sys.exit(
-            f"{maps}: is drawn in {drawn_in}, the truth is in the capture's own coordinates: vdgs map --crs source"
+            f"{maps}: is drawn in {drawn_in}, the truth is in the capture's own coordinates: vdgs ortho --crs source"
         )
     note = (town_folder / "capture.md").read_text(encoding="utf-8")
     seed, extent = (float(re.search(rf"^- {name}: (.*)$", note, re.M).group(1)) for name in ("seed", "extent_m"))
@@ -63,13 +62,13 @@ def main(town_folder: Path, maps: Path) -> None:
 def true_map(seed: int, extent: float, transform, shape) -> tuple[np.ndarray, np.ndarray]:
     """Height [h, w] and colours [h, w, 3] uint8 at the pixels of a map."""
     town = build_town(seed, extent)
-    tracer = Tracer(town.mesh)
+    tracer = RayTracer(town.mesh)
     with ThreadPoolExecutor(2) as pool:
-        sky = sky_map(tracer, town.terrain, town.zones, extent / 2 + 40, pool)
+        sky = make_sky_map(tracer, town.terrain, town.zones, extent / 2 + 40, pool)
     pitch = abs(transform.a)
     height, image = np.empty(shape), np.empty((*shape, 3), np.uint8)
     down = np.array([0, 0, -1], np.float32)
-    offsets = sample_offsets(SAMPLES)
+    offsets = pixel_sample_offsets(SAMPLES)
     for row in range(shape[0]):
         columns = np.arange(shape[1]) + 0.5
         places = np.stack([columns, np.full(shape[1], row + 0.5)], 1)[:, None] + np.vstack([[[0, 0]], offsets])

@@ -2,7 +2,7 @@
 
     python -m experiments.reports.analyses.metering RUN
 
-RUN was trained with --exposure. Errors are those of photographs that the law was not learnt from, one left out after
+RUN was trained with --exposure-compensation. Errors are those of photographs that the law was not learnt from, one left out after
 the other; all are training photographs, against the training photographs before and after them.
 """
 
@@ -12,10 +12,10 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from experiments.microbench.machine import describe
 
-from vdgs.evaluation.exposures import exposures_of
-from vdgs.runs.opening import open_run
+from experiments.microbench.hardware_info import describe
+from vdgs.evaluation.view_exposures import make_exposures
+from vdgs.runs.open_run import open_run
 
 #: What fitted exposures are compared on.
 GREY = 0.4
@@ -26,17 +26,17 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     asked = parser.parse_args()
     run = open_run(asked.run, "coarse")
-    exposures = exposures_of(run.model, run.capture)
+    exposures = make_exposures(run.model, run.capture)
     if exposures is None:
-        raise SystemExit(f"{asked.run}: was trained without --exposure")
-    law = exposures.metering
+        raise SystemExit(f"{asked.run}: was trained without --exposure-compensation")
+    law = exposures.auto_exposure
     grey = np.stack([exposures(view).numpy() @ [GREY, GREY, GREY, 1.0] for view in run.capture.train_views])
     print(describe())
     print(
         f"{len(grey)} training photographs, in which grey deviates by {np.log(grey.mean(1)).std():.1%}; errors of the"
     )
     print("logarithm of brightness:")
-    print(f"by neighbours alone {law.unforetold[0]:.4f}, by what is metered as well {law.unforetold[1]:.4f}")
+    print(f"by neighbours alone {law.residual_error[0]:.4f}, by what is metered as well {law.residual_error[1]:.4f}")
     print(f"a view that is 1 % brighter is exposed {law.slope:+.2f} %" if law.slope else "the law is not used")
 
 
