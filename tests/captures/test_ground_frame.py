@@ -339,6 +339,21 @@ def test_a_similarity_survives_gross_outliers():
     np.testing.assert_allclose(similarity.apply(source[12:]), target[12:], atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [6, 7, 8])
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_of_few_points_a_similarity_leaves_out_wrong_ones_and_hardly_ever_good_ones(count, wrong):
+    generator = np.random.default_rng(count)
+    surveys, lost = 60, 0
+    for _ in range(surveys):
+        target = generator.uniform(-100, 100, (count, 3)) * [1, 1, 0.05]
+        source = target + generator.normal(size=(count, 3)) * [0.03, 0.03, 0.06]
+        source[:wrong] += [2.0, -1.0, 1.0]
+        _, inliers = fit_similarity_robust(source, target)
+        assert not inliers[:wrong].any()
+        lost += not inliers[wrong:].all()
+    assert lost <= 0.05 * surveys
+
+
 def test_the_geometric_median_turns_with_its_points():
     generator = np.random.default_rng(2)
     points = generator.exponential(size=(500, 3))
