@@ -24,9 +24,9 @@ from vdgs.system.units import two_digits
 MIN_ATTITUDES = 3
 #: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
 MIN_HEADING_SPREAD = 0.3
-#: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, are no
-#: measurements (choice).
-SCATTER_DEG, CONTRADICT_DEG = 20.0, 45.0
+#: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, and by so
+#: many standard deviations of it, are no measurements (choice).
+SCATTER_DEG, CONTRADICT_DEG, CONTRADICT_SIGMAS = 20.0, 45.0, 3.0
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
 #: Recorded headings count from so many on that agree so well (mean of unit vectors); the other way round is so far.
@@ -312,7 +312,8 @@ def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
     apart = float(np.degrees(np.arccos(np.clip(mean @ direction, -1, 1))))
     level = rotation_to_z(mean)
     tilt, several = _tilt(rotations @ level.T, down)
-    if scatter > SCATTER_DEG or (sure and not several and apart > CONTRADICT_DEG):
+    most = max(CONTRADICT_DEG, CONTRADICT_SIGMAS * views.deviation_deg)
+    if scatter > SCATTER_DEG or (sure and not several and apart > most):
         return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
     found = level.T @ np.append(-tilt, 1.0)
     deviation = float(np.hypot(scatter / np.sqrt(len(seen)), HANGS_DEG if several else HANGS_ALIKE_DEG))
