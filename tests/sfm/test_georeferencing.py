@@ -288,6 +288,32 @@ def test_positions_that_are_another_flights_are_left_out():
     assert fit.similarity.scale == pytest.approx(SCALE, rel=0.02)
 
 
+def test_a_flight_far_from_where_its_photographs_were_put_is_said_and_has_no_datum():
+    """Places that look alike taken for one: 12 of one flight and 9 of another, 400 m away and 20 m higher."""
+    rng = np.random.default_rng(3)
+    places = strips(3, 7, 14.0, rng)
+    recorded = places + rng.normal(0, 0.05, places.shape)
+    flights = np.arange(21) // 12
+    recorded[12:] += [400.0, 50, 20]
+    problem, _ = problem_of(places, recorded, 3)
+    positions = GpsPriors(
+        image_indices=np.arange(21), enu=recorded, gps_std=np.ones((21, 3)), origin=(0.0, 0.0, 0.0),
+        altitude_reference="", source="EXIF", notes=(), flights=flights,
+    )  # fmt: skip
+    far = HEIGHT_M / SCALE
+    levelled, offsets = georegistration._without_offsets(problem, positions, np.arange(21), far)
+    assert offsets is None
+    fit = fit_positions(levelled)
+    elsewhere = georegistration._elsewhere(fit, far)
+    assert (elsewhere == (flights == 1)).all()
+    assert untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, flights) is None
+    (note,) = georegistration._of_elsewhere(fit, elsewhere, HEIGHT_M)
+    assert re.search(r"9 of 21 positions lie about 40\d m", note)
+    assert "5.4 times as far as the cameras see" in note
+    sound = fit_positions(problem_of(places, places + rng.normal(0, 2, places.shape), 3)[0])
+    assert georegistration._of_elsewhere(sound, georegistration._elsewhere(sound, far), HEIGHT_M) == []
+
+
 def test_altitudes_of_a_flight_that_is_not_trusted_are_said():
     """They drift, and count from elsewhere: no datum explains them, and what they say otherwise is no secret."""
     flights, trusted = np.repeat([0, 1, 2], [20, 10, 2]), np.arange(32) < 20
