@@ -466,6 +466,24 @@ def test_a_table_of_several_systems_is_refused_and_blank_cells_are_none(tmp_path
         read_gps_table(tmp_path / "t.csv")
 
 
+@pytest.mark.parametrize(
+    ("system", "x", "y"),
+    [
+        ("EPSG:2056", 2680249.7, 1239318.9), ("EPSG:2056+5728", 2680249.7, 1239318.9), ("EPSG:32719", 351400, 6292300),
+        ("EPSG:31467", 3500000, 5500000),
+    ],
+)  # fmt: skip
+def test_x_and_y_that_only_fit_where_their_system_is_used_once_exchanged_are_refused(tmp_path, system, x, y):
+    pytest.importorskip("pyproj")
+    (file := tmp_path / "table.csv").write_text(f"{system}\nname;Y;X;Z\na.jpg;{x};{y};500\n")
+    with pytest.raises(CaptureError, match=r"only once x and y change places\. Write x \(east\) first"):
+        read_gps_table(file)
+    file.write_text(f"{system}\nname;X;Y;Z\na.jpg;{x};{y};500\n")
+    assert len(read_gps_table(file).rows) == 1
+    file.write_text(f"{system}\nname;X;Y;Z\na.jpg;{x + 150_000};{y};500\n")  # a little beside its zone
+    assert len(read_gps_table(file).rows) == 1
+
+
 @pytest.mark.parametrize("axes", ["", ',AXIS["Lat",NORTH],AXIS["Lon",EAST]', ',AXIS["Lon",EAST],AXIS["Lat",NORTH]'])
 @pytest.mark.parametrize("heights", [False, True])
 @pytest.mark.parametrize("shift", ["", "TOWGS84[0,0,0,0,0,0,0],"])

@@ -24,6 +24,8 @@ _STARTS = re.compile(
 #: Codes in whatever stands around them: `EPSG:32633+5773`, `EPSG=32633`, `UTM zone 33N (EPSG::32633)`, addresses.
 _CODES = re.compile(r"(?:EPSG|SRID)(?:\.io/|\.xml#|[\s:=_-]{0,3})(\d{4,6}(?:\+\d{4,6})?)(?!\d|\.)", re.I)
 _WKT = re.compile(r"\w*(CS|CRS)\[", re.I)
+#: Zones and national systems are used so far beside the area that they are made for (choice).
+BESIDE_DEG = 3.0
 #: A line that may be a name alone: no table of words, no numbers on their own.
 _WORDS = re.compile(r"(?!.*(^|\s)[\d.]+\s+[\d.])[A-Za-z][^,;\t]{2,60}")
 #: What may stand around a name: quotes, and the separators by which spreadsheets fill a line.
@@ -110,6 +112,11 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
                 "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
             )
         first, second = (y, x) if _counts_north_first(crs) else (x, y)
+        if _is_exchanged(crs, change, first, second):
+            raise CaptureError(
+                f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} lie where {crs.name} ({where}) is used only "
+                "once x and y change places. Write x (east) first, or under its name: easting, northing."
+            )
         if flat:  # heights are metres as they are, whatever they are measured from
             latitude, longitude = change.transform(first, second)
         else:
@@ -128,6 +135,24 @@ def to_geodetic(header: str, file: Path, where: str = "the first line") -> tuple
         )
     feet = flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or "")
     return changed, f"{name}{HEIGHTS_IN_METERS}" if feet else name
+
+
+def _is_exchanged(crs: Any, change: Any, first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether places [n] lie where a projected system is used only once their coordinates are exchanged, and far from
+    there as they are."""
+    if not crs.is_projected or not len(first):
+        return False
+    area = next((part.area_of_use for part in (crs, *crs.sub_crs_list) if part.area_of_use is not None), None)
+    if area is None or area.west > area.east:
+        return False
+
+    def is_near(place: tuple[float, ...]) -> bool:
+        latitude, longitude = place[:2]
+        north_south = area.south - BESIDE_DEG <= latitude <= area.north + BESIDE_DEG
+        return north_south and area.west - BESIDE_DEG <= longitude <= area.east + BESIDE_DEG
+
+    one, other, height = float(np.median(first)), float(np.median(second)), () if len(crs.axis_info) == 2 else (0.0,)
+    return not is_near(change.transform(one, other, *height)) and is_near(change.transform(other, one, *height))
 
 
 def _counts_north_first(crs: Any) -> bool:
