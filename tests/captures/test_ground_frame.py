@@ -340,18 +340,20 @@ def test_a_similarity_survives_gross_outliers():
 
 
 @pytest.mark.parametrize("count", [6, 7, 8])
-@pytest.mark.parametrize("wrong", [0, 1])
-def test_of_few_points_a_similarity_leaves_out_wrong_ones_and_hardly_ever_good_ones(count, wrong):
+@pytest.mark.parametrize(("wrong", "up"), [(0, 0.06), (1, 0.06), (0, 0.12)])
+def test_of_few_points_a_similarity_leaves_out_wrong_ones_and_hardly_ever_good_ones(count, wrong, up):
+    """Heights may be far worse than places: a model may be bent."""
     generator = np.random.default_rng(count)
-    surveys, lost = 60, 0
+    surveys, lost, found = 60, 0, 0
     for _ in range(surveys):
         target = generator.uniform(-100, 100, (count, 3)) * [1, 1, 0.05]
-        source = target + generator.normal(size=(count, 3)) * [0.03, 0.03, 0.06]
+        source = target + generator.normal(size=(count, 3)) * [0.03, 0.03, up]
         source[:wrong] += [2.0, -1.0, 1.0]
         _, inliers = fit_similarity_robust(source, target)
-        assert not inliers[:wrong].any()
+        found += not inliers[:wrong].any()
         lost += not inliers[wrong:].all()
     assert lost <= 0.05 * surveys
+    assert found >= 0.9 * surveys
 
 
 def test_the_geometric_median_turns_with_its_points():

@@ -15,7 +15,9 @@ from scipy.special import fdtrc
 MAX_COLLINEAR_RATIO = 0.02
 #: Of so few points a robust standard deviation is no guide, as three of them fit anything. Points are left out there
 #: where chance would let any as many stand out this seldom, and where each is so many standard deviations off (choice).
-FEW_POINTS, SIGNIFICANT, OUTLIER_SIGMAS = 30, 0.001, 7.0
+FEW_POINTS, SIGNIFICANT, OUTLIER_SIGMAS = 30, 0.0005, 7.0
+#: One axis has a variance of its own where chance would make one of three so much worse this seldom (choice).
+WORSE_AXIS = 0.005
 #: A similarity of space has so many parameters.
 PARAMETERS = 7
 
@@ -100,6 +102,27 @@ def _triples(count: int, most: int) -> Iterator[np.ndarray]:
         yield generator.choice(count, size=3, replace=False)
 
 
+@dataclass(frozen=True)
+class _Left:
+    """What a similarity to some points leaves of them."""
+
+    squares: float
+    """Summed over points and axes; infinite where the points fix no similarity."""
+    worst: float = 0.0
+    """Those along the axis that has most."""
+    nearest: float = 0.0
+    """How far the nearest of the other points is from it."""
+
+    def variance(self, count: int, floor: float) -> tuple[float, float]:
+        """Of the worst axis of so many points, and how many observations are free to tell it: those of all axes, unless
+        that one is plainly worse than the others, as heights are where a model is bent."""
+        free = 3 * count - PARAMETERS
+        alone, rest = 3 * self.worst / free, 1.5 * max(self.squares - self.worst, floor**2) / free
+        if 3 * fdtrc(free / 3, 2 * free / 3, alone / rest) < WORSE_AXIS:
+            return max(alone, floor**2), free / 3
+        return max(alone, floor**2 / free), free
+
+
 def _without_outliers(source: np.ndarray, target: np.ndarray, start: Similarity, floor: float) -> np.ndarray:
     """All of few points, [n] bool, but for the fewest of them after which no more stand out by an F test.
 
@@ -107,22 +130,21 @@ def _without_outliers(source: np.ndarray, target: np.ndarray, start: Similarity,
     """
     count = len(source)
     kept = [np.ones(count, bool)]
-    left, nearest = [_squares(source, target, kept[0])[0]], [0.0]
+    left = [_left(source, target, kept[0])]
     for number in range(count - 1, max(3, count // 2), -1):
         begun = (start, fit_similarity(source[kept[-1]], target[kept[-1]]))
         found = [_trimmed(source, target, each, number) for each in begun]
-        squares = [_squares(source, target, each) for each in found]
-        best = min((0, 1), key=lambda k: squares[k])
+        facts = [_left(source, target, each) for each in found]
+        best = min((0, 1), key=lambda k: facts[k].squares)
         kept.append(found[best])
-        left.append(squares[best][0])
-        nearest.append(squares[best][1])
+        left.append(facts[best])
 
     def stand_out(few: int, more: int) -> bool:
-        changed, free = 3 * (more - few), 3 * (count - more) - PARAMETERS
-        variance = max(left[more], floor**2) / free
-        ratio = (left[few] - left[more]) / changed / variance
+        variance, free = left[more].variance(count - more, floor)
+        changed = 3 * (more - few)
+        ratio = (left[few].squares - left[more].squares) / changed / variance
         chance = comb(count - few, more - few) * fdtrc(changed, free, max(0.0, ratio))
-        return bool(chance < SIGNIFICANT and nearest[more] > OUTLIER_SIGMAS * np.sqrt(variance))
+        return bool(chance < SIGNIFICANT and left[more].nearest > OUTLIER_SIGMAS * np.sqrt(variance))
 
     numbers = range(len(kept))
     return next(kept[few] for few in numbers if not any(stand_out(few, more) for more in numbers[few + 1 :]))
@@ -141,13 +163,13 @@ def _trimmed(source: np.ndarray, target: np.ndarray, start: Similarity, number: 
     return kept
 
 
-def _squares(source: np.ndarray, target: np.ndarray, kept: np.ndarray) -> tuple[float, float]:
-    """What a similarity to the points leaves of them, squared, and how far the nearest of the others is from it; the
-    first is infinite where they fix none."""
+def _left(source: np.ndarray, target: np.ndarray, kept: np.ndarray) -> _Left:
     if is_collinear(source[kept]):
-        return float("inf"), 0.0
-    residuals = _residuals(fit_similarity(source[kept], target[kept]), source, target)
-    return float((residuals[kept] ** 2).sum()), float(residuals[~kept].min(initial=np.inf))
+        return _Left(float("inf"))
+    off = fit_similarity(source[kept], target[kept]).apply(source) - target
+    squares = np.linalg.eigvalsh(off[kept].T @ off[kept])
+    others = np.linalg.norm(off[~kept], axis=1)
+    return _Left(float(squares.sum()), float(squares[-1]), float(others.min(initial=np.inf)))
 
 
 def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -> np.ndarray:
