@@ -420,7 +420,7 @@ def test_rows_without_names_of_columns_have_accuracies_behind_three_angles(tmp_p
     [
         ("EPSG:31467", 3500000, 5400000, 3, "converted from DHDN to WGS 84, good to 3 m"),
         ("EPSG:27700", 450000, 250000, 2, "good to 2 m"),
-        ("EPSG:2434", 500000, 3400000, 300, "knows no shift from Beijing 1954"),
+        ("EPSG:2434", 500000, 3400000, 300, "are taken as of WGS 84, for PROJ knows no shift from Beijing 1954"),
         ("+proj=utm +zone=33 +ellps=bessel", 500000, 5400000, 300, "no datum: taken as WGS 84"),
         ("+proj=utm +zone=33 +ellps=bessel +towgs84=598,73,418", 500000, 5400000, 0, ""),
         ("EPSG:25832", 500000, 5400000, 0, ""),

@@ -191,7 +191,7 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
         if datum.name == "unknown":  # `to_geodetic` says so
             return UNKNOWN_DATUM_M, ""
         return UNKNOWN_DATUM_M, (
-            f"PROJ knows no shift from {datum.name} to WGS 84 there: taken as of WGS 84 (may be off by "
+            f"taken as of WGS 84, for PROJ knows no shift from {datum.name} there (may be off by "
             f"{UNKNOWN_DATUM_M:.0f} m)"
         )
     moved = np.abs(np.subtract(way.transform(longitude, latitude), (longitude, latitude))).max()
