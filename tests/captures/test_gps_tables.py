@@ -9,6 +9,7 @@ import pytest
 
 from support.flights import small_photographs
 from vdgs.captures.coordinate_systems import datum_error, names_a_system, to_geodetic
+from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -115,6 +116,12 @@ def test_columns_of_heights_are_named_in_tables_of_any_system(tmp_path):
         ("name,lat,lon,alt\na.jpg,one,2,3\n", "line 2: .* are not numbers"),
         ("name,lat,lon,alt\na.jpg,-70.6,233.5,1e9\n", "line 2: .* no place on Earth"),
         ("name,lat,lon,alt\na.jpg,-97.6,33.5,10\n", "line 2: .* no place on Earth"),
+        (
+            "name,lat_deg,lat_min,lat_sec,lon_deg,lon_min,lon_sec\na.jpg,-33,30,1.5,-70,36,2\n",
+            "columns .*'lat_min', 'lat_",
+        ),
+        ("name;Latitude (°);Latitude (min);Lon;Longitude (min)\na.jpg;-33;30;-70;36\n", "minutes and seconds in col"),
+        ("name,lat_d,lat_m,lat_s,lon_d,lon_m,lon_s\na.jpg,-33,30,1.5,-70,36,2\n", "minutes and seconds in columns"),
         ("EPSG:32719\na.jpg 1e12 1e12 5\n", "line 2: .* is no place in"),
         ("\0\1\2\3\0\0\0\0", "is not a text file.*save a spreadsheet as CSV"),
         ("EPSG:4326\n-70.6 -33.5 500 100 200 a.jpg P1\n", "control points is given as --gcp"),
@@ -163,6 +170,8 @@ def test_columns_of_names_are_known_by_heading_or_by_what_they_hold(tmp_path, nu
         ("照片名称,纬度,经度,高度\n张a.jpg,-33.5,-70.6,500\n", "gb18030"),
         ("照片名称,lat,lon,alt\n张a.jpg,-33.5,-70.6,500\n", "gbk"),
         ("Dateiname;Breitengrad;Längengrad;Höhe\nüa.jpg;-33,5;-70,6;500\n", "cp1252"),
+        ("Dateiname;Breite;Laenge;Hoehe\nüa.jpg;-33,5;-70,6;500\n", "cp1252"),
+        ("name,lat,lat_s,lon,lon_s,alt\nüa.jpg,-33.5,0.01,-70.6,0.02,500\n", "cp1252"),
         ("name,lat,lon,alt\nüöa.jpg,-33.5,-70.6,500\n", "cp1252"),
     ],
 )
@@ -185,6 +194,15 @@ def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
     assert found.gps_std[0] == pytest.approx([0.5, 0.5, 1.5])
     assert any("3 rows are of photographs that are not there; left out (4.jpg, 5.jpg, 6.jpg)" in n for n in found.notes)
     assert any("1 of 8 rows have no position" in note for note in found.notes)
+
+
+def test_rows_that_are_there_twice_are_of_photographs_that_are_there(tmp_path):
+    seen = small_photographs(tmp_path, NAMES)
+    rows = "".join(f"{name},-33.5{k},-70.6,500\n" for k, name in enumerate(NAMES))
+    (file := tmp_path / "gps.csv").write_text(f"name,lat,lon,alt\n{rows}{rows}")
+    found = read_gps_priors(seen, file, (1.0, 2.0))
+    assert len(found) == len(NAMES)
+    assert not any("not there" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
@@ -403,7 +421,7 @@ def test_rows_without_names_of_columns_have_accuracies_behind_three_angles(tmp_p
     [
         ("EPSG:31467", 3500000, 5400000, 3, "converted from DHDN to WGS 84, good to 3 m"),
         ("EPSG:27700", 450000, 250000, 2, "good to 2 m"),
-        ("EPSG:2434", 500000, 3400000, 300, "knows no shift from Beijing 1954"),
+        ("EPSG:2434", 500000, 3400000, 300, "are taken as of WGS 84, for PROJ knows no shift from Beijing 1954"),
         ("+proj=utm +zone=33 +ellps=bessel", 500000, 5400000, 300, "no datum: taken as WGS 84"),
         ("+proj=utm +zone=33 +ellps=bessel +towgs84=598,73,418", 500000, 5400000, 0, ""),
         ("EPSG:25832", 500000, 5400000, 0, ""),
@@ -431,6 +449,14 @@ def test_moments_of_a_drone_are_matched_by_number(tmp_path):
     assert found.gps_std[0] == pytest.approx([0.02, 0.02, 0.03])
 
 
+def test_moments_of_one_flight_among_several_are_refused_with_what_can_be_done(tmp_path):
+    file = tmp_path / "flight.MRK"
+    file.write_text("1\t280234.1\t[2145]\t  12,N\t 34,E\t -20,V\t-33.5,Lat\t-70.6,Lon\t500,Ellh\t0.01, 0.02, 0.03\n")
+    names = ["a/DJI_0001.jpg", "b/DJI_0001.jpg"]
+    with pytest.raises(CaptureError, match=r"for one flight\. Place the flights one by one, or give one table"):
+        match_rows(names, read_gps_table(file).rows, file, numbered=True)
+
+
 def test_a_table_of_several_systems_is_refused_and_blank_cells_are_none(tmp_path):
     rows = ["a.jpg,500000,5700000,100,{}", "b.jpg,500100,5700000,101,EPSG:32633", "c.jpg,500100,5700100,101,EPSG:32633"]
     text = "\n".join(["Name,Easting,Northing,Elevation,CS name", *rows])
@@ -439,6 +465,24 @@ def test_a_table_of_several_systems_is_refused_and_blank_cells_are_none(tmp_path
     (tmp_path / "t.csv").write_text(text.format("EPSG:32632"))
     with pytest.raises(CaptureError, match="several coordinate systems"):
         read_gps_table(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize(
+    ("system", "x", "y"),
+    [
+        ("EPSG:2056", 2680249.7, 1239318.9), ("EPSG:2056+5728", 2680249.7, 1239318.9), ("EPSG:32719", 351400, 6292300),
+        ("EPSG:31467", 3500000, 5500000),
+    ],
+)  # fmt: skip
+def test_x_and_y_that_only_fit_where_their_system_is_used_once_exchanged_are_refused(tmp_path, system, x, y):
+    pytest.importorskip("pyproj")
+    (file := tmp_path / "table.csv").write_text(f"{system}\nname;Y;X;Z\na.jpg;{x};{y};500\n")
+    with pytest.raises(CaptureError, match=r"only once x and y change places\. Write x \(east\) first"):
+        read_gps_table(file)
+    file.write_text(f"{system}\nname;X;Y;Z\na.jpg;{x};{y};500\n")
+    assert len(read_gps_table(file).rows) == 1
+    file.write_text(f"{system}\nname;X;Y;Z\na.jpg;{x + 150_000};{y};500\n")  # a little beside its zone
+    assert len(read_gps_table(file).rows) == 1
 
 
 @pytest.mark.parametrize("axes", ["", ',AXIS["Lat",NORTH],AXIS["Lon",EAST]', ',AXIS["Lon",EAST],AXIS["Lat",NORTH]'])

@@ -339,6 +339,23 @@ def test_a_similarity_survives_gross_outliers():
     np.testing.assert_allclose(similarity.apply(source[12:]), target[12:], atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [6, 7, 8])
+@pytest.mark.parametrize(("wrong", "up"), [(0, 0.06), (1, 0.06), (0, 0.12)])
+def test_of_few_points_a_similarity_leaves_out_wrong_ones_and_hardly_ever_good_ones(count, wrong, up):
+    """Heights may be far worse than places: a model may be bent."""
+    generator = np.random.default_rng(count)
+    surveys, lost, found = 60, 0, 0
+    for _ in range(surveys):
+        target = generator.uniform(-100, 100, (count, 3)) * [1, 1, 0.05]
+        source = target + generator.normal(size=(count, 3)) * [0.03, 0.03, up]
+        source[:wrong] += [2.0, -1.0, 1.0]
+        _, inliers = fit_similarity_robust(source, target)
+        found += not inliers[:wrong].any()
+        lost += not inliers[wrong:].all()
+    assert lost <= 0.05 * surveys
+    assert found >= 0.9 * surveys
+
+
 def test_the_geometric_median_turns_with_its_points():
     generator = np.random.default_rng(2)
     points = generator.exponential(size=(500, 3))

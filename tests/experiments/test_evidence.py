@@ -88,4 +88,4 @@ def test_analyses_that_are_here_can_be_imported(analysis):
     for package in ("rasterio", "pycolmap"):
         if f"import {package}" in analysis.read_text(encoding="utf-8"):
             pytest.importorskip(package)
-    assert import_module(f"experiments.reports.analyses.{analysis.stem}").main
+    import_module(f"experiments.reports.analyses.{analysis.stem}")

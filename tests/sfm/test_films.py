@@ -125,6 +125,11 @@ def test_no_fix_and_no_place_are_no_position():
     assert read_telemetry([(0.0, "Turn left at the lights.")]) == ()
 
 
+@pytest.mark.parametrize("text", ["", "x", "1\n\n[latitude: 47.0] [longitude: 8.0]\n", "\x00\x31\x00\x0a"])
+def test_subtitles_without_times_say_nothing(text):
+    assert read_subtitles(text) == []
+
+
 def test_positions_lie_between_those_of_the_records_and_are_not_made_up():
     text = "1\n00:00:01,000 --> 00:00:02,000\n{a}\n\n2\n00:00:02,000 --> 00:00:03,000\n{b}\n"
     a, b = ("[latitude: 47.0] [longitude: 8.0] [rel_alt: 10.0]", "[latitude: 47.1] [longitude: 8.4] [rel_alt: 20.0]")

@@ -24,6 +24,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.sfm import incremental_mapper
+from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy
 from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
@@ -274,6 +275,23 @@ def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blank
 
 
 # ------------------------------------------------------------------------------------------------- placing
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(5, 0), (6, 0), (7, 1), (9, 0)])
+def test_the_stated_accuracy_of_few_points_holds(count, wrong):
+    rng = np.random.default_rng(count)
+    surveys, beyond = 100, np.zeros(3)
+    for _ in range(surveys):
+        surveyed = rng.uniform(-100, 100, (count, 3)) * [1, 1, 0.05]
+        seen = surveyed + rng.normal(size=(count, 3)) * [0.03, 0.03, 0.06]
+        seen[:wrong] += [2.0, -1.0, 1.0]
+        found, trusted = fit_to_gcps(seen, surveyed)
+        stated = gcp_accuracy(found.apply(seen[trusted]), surveyed[trusted], int(trusted.sum()))
+        middle = surveyed[trusted].mean(axis=0)
+        off = np.abs(found.apply(middle[None])[0] - middle)
+        beyond += [100 * abs(found.scale - 1) > stated.scale_percent, np.hypot(*off[:2]) > stated.place_m[0],
+                   off[2] > stated.place_m[1]]  # fmt: skip
+    assert (beyond <= 0.1 * surveys).all()
 
 
 def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: str):

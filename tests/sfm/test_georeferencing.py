@@ -21,6 +21,7 @@ from vdgs.sfm.flights import untrusted_offsets
 from vdgs.sfm.georeferencing import FOOT_M, Doubts
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_metadata import attitude_from_gimbal
 
 pytestmark = pytest.mark.slow
 
@@ -287,6 +288,32 @@ def test_positions_that_are_another_flights_are_left_out():
     assert fit.similarity.scale == pytest.approx(SCALE, rel=0.02)
 
 
+def test_a_flight_far_from_where_its_photographs_were_put_is_said_and_has_no_datum():
+    """Places that look alike taken for one: 12 of one flight and 9 of another, 400 m away and 20 m higher."""
+    rng = np.random.default_rng(3)
+    places = strips(3, 7, 14.0, rng)
+    recorded = places + rng.normal(0, 0.05, places.shape)
+    flights = np.arange(21) // 12
+    recorded[12:] += [400.0, 50, 20]
+    problem, _ = problem_of(places, recorded, 3)
+    positions = GpsPriors(
+        image_indices=np.arange(21), enu=recorded, gps_std=np.ones((21, 3)), origin=(0.0, 0.0, 0.0),
+        altitude_reference="", source="EXIF", notes=(), flights=flights,
+    )  # fmt: skip
+    far = HEIGHT_M / SCALE
+    levelled, offsets = georegistration._without_offsets(problem, positions, np.arange(21), far)
+    assert offsets is None
+    fit = fit_positions(levelled)
+    elsewhere = georegistration._elsewhere(fit, far)
+    assert (elsewhere == (flights == 1)).all()
+    assert untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, flights) is None
+    (note,) = georegistration._of_elsewhere(fit, elsewhere, HEIGHT_M)
+    assert re.search(r"9 of 21 positions lie about 40\d m", note)
+    assert "5.4 times as far as the cameras see" in note
+    sound = fit_positions(problem_of(places, places + rng.normal(0, 2, places.shape), 3)[0])
+    assert georegistration._of_elsewhere(sound, georegistration._elsewhere(sound, far), HEIGHT_M) == []
+
+
 def test_altitudes_of_a_flight_that_is_not_trusted_are_said():
     """They drift, and count from elsewhere: no datum explains them, and what they say otherwise is no secret."""
     flights, trusted = np.repeat([0, 1, 2], [20, 10, 2]), np.arange(32) < 20
@@ -348,6 +375,40 @@ def test_views_that_look_down_tell_up_over_a_slope():
     assert np.degrees(np.arccos(up[2])) < 6
     assert sure
     assert deviation >= 3
+
+
+def up_of_an_arc(recorded_pitch_deg: float) -> tuple[Up, list[str]]:
+    """18 photographs on an arc of 85 degrees about a building, 20 degrees down, and the gimbal's angles."""
+    rng = np.random.default_rng(0)
+    turn = Rotation.random(random_state=3).as_matrix()
+    images, photographs = {}, []
+    for k in range(18):
+        angle = np.radians(5 * k)
+        place, yaw = np.array([40 * np.cos(angle), 40 * np.sin(angle), 20.0]), 270 - 5 * k
+        pose = attitude_from_gimbal(yaw, -20.0, 0.0).camera_from_enu @ turn.T
+        recorded = attitude_from_gimbal(yaw, recorded_pitch_deg + rng.normal(0, 0.1), 0.0)
+        images[k] = SimpleNamespace(
+            name=str(k), has_pose=True, projection_center=lambda place=place: turn @ place,
+            cam_from_world=lambda pose=pose: SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: pose)),
+        )  # fmt: skip
+        photographs.append(SimpleNamespace(name=str(k), attitude=recorded, face=""))
+    wall = rng.uniform(-1, 1, (400, 3)) * [8, 8, 5] + [0, 0, 5]
+    points = {k: SimpleNamespace(xyz=turn @ place) for k, place in enumerate(wall)}
+    up, notes = georegistration.up_of(SimpleNamespace(images=images, points3D=points), photographs)
+    return replace(up, direction=up.direction @ turn), notes
+
+
+def test_a_vague_guess_of_up_by_views_leaves_recorded_attitudes_that_agree():
+    up, notes = up_of_an_arc(-20.0)
+    assert notes == []
+    assert up.how == "the recorded attitudes"
+    assert np.degrees(np.arccos(up.direction[2])) < 1
+
+
+def test_attitudes_that_plainly_contradict_the_views_are_not_used():
+    up, notes = up_of_an_arc(160.0)  # looks up and back
+    assert "contradict" in notes[0]
+    assert up.how == "the views"
 
 
 # ---------------------------------------------------------------------------------------------- control points

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from rich.console import Console
 
 pytest.importorskip("embreex")
 
-from support.flights import ORIGIN, Flight, copy_folder, sightings
+from support.flights import ORIGIN, Flight, copy_folder, sightings, write_photograph
 from vdgs.captures.loading import load_capture
+from vdgs.captures.output_guard import is_capture
 from vdgs.captures.reconstruction import read_reconstruction, report_rows
 from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
@@ -176,3 +178,15 @@ def test_bad_lists_of_distances_are_refused_with_the_line(nine, capture, tmp_pat
     (tmp_path / "bars.txt").write_text(text)
     with pytest.raises(CaptureError, match=said):
         again(nine, capture, scale_bar=tmp_path / "bars.txt")
+
+
+def test_two_photographs_that_were_joined_are_no_capture(nine, tmp_path):
+    (tmp_path / "card").mkdir()
+    for name in nine.names[:2]:
+        shutil.copy(nine.folder / name, tmp_path / "card")
+    noise = np.random.default_rng(0).integers(0, 255, (300, 400, 3), np.uint8)
+    write_photograph(tmp_path / "card" / "other.jpg", noise, 5, None)
+    with pytest.raises(CaptureError, match="only 2 photographs could be joined; a scene needs 3"):
+        reconstruct(SfmRequest(image_folders=(tmp_path / "card",), output=tmp_path / "out", threads=1), console())
+    assert not (tmp_path / "out" / "sparse").exists()
+    assert not is_capture(tmp_path / "out")

@@ -272,6 +272,10 @@ DETAILS = {0x920A: 8.5, 0xA002: 400, 0xA003: 300, 0xA20E: 40.0, 0xA210: 4}
         pytest.param({0x920A: 0, 0xA404: 2.0, 0xA405: 60}, (400, 300), 1.733, EQUIVALENT, False, id="phone, zoomed"),
         pytest.param({0xA405: 30}, (400, 225), 0.85, SENSOR, False, id="cut above and below"),
         pytest.param({0xA405: 30}, (200, 300), 340 / 300, SENSOR, False, id="cut at the sides"),
+        pytest.param({0xA405: 30}, (320, 250), 340 / 320, SENSOR, False, id="cut on all sides"),
+        pytest.param({0xA405: 30}, (250, 320), 340 / 320, SENSOR, False, id="cut on all sides, upright"),
+        pytest.param({0xA405: 30}, (160, 90), 0.85, SENSOR, True, id="cut and shrunk"),
+        pytest.param({0xA405: 30}, (160, 119), 0.85, SENSOR, False, id="shrunk, rounded"),
     ],
 )
 def test_ways_to_the_focal_length_are_held_against_each_other(changes, size, focal, source, doubted):
@@ -279,6 +283,16 @@ def test_ways_to_the_focal_length_are_held_against_each_other(changes, size, foc
     assert lens is not None
     assert (lens.focal, lens.source) == (pytest.approx(focal, abs=2e-3), source)
     assert bool(lens.doubt) is doubted
+
+
+@pytest.mark.parametrize(("size", "said"), [((320, 250), "cut only"), ((200, 120), "shrunk"), ((400, 225), "")])
+def test_what_is_assumed_of_photographs_that_were_cut_on_all_sides_is_said(tmp_path, size, said):
+    file = tmp_path / "photograph.jpg"
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x920A: 8.5, 0xA002: 400, 0xA003: 300, 0xA405: 30})
+    Image.new("RGB", size).save(file, exif=exif)
+    doubts = read_image_metadata(file, file.name).doubts
+    assert [doubt.endswith(f"taken as if it was {said}") for doubt in doubts] == ([True] if said else [])
 
 
 def test_a_contradiction_names_both_and_is_not_held(tmp_path):

@@ -26,6 +26,8 @@ _CODES = re.compile(r"(?:EPSG|SRID)(?:\.io/|\.xml#|[\s:=_-]{0,3})(\d{4,6}(?:\+\d
 #: What stands for a system of heights beside a code, and is no code.
 _UNKNOWN_HEIGHTS = re.compile(r"(?:EPSG|SRID)[\s:=_-]{0,3}\d{4,6}\+(?!\d)([^\s,;]+)$", re.I)
 _WKT = re.compile(r"\w*(CS|CRS)\[", re.I)
+#: Zones and national systems are used so far beside the area that they are made for (choice).
+BESIDE_DEG = 3.0
 #: A line that may be a name alone: no table of words, no numbers on their own.
 _WORDS = re.compile(r"(?!.*(^|\s)[\d.]+\s+[\d.])[A-Za-z][^,;\t]{2,60}")
 #: Lists of photographs begin so; PROJ looks half a second for a name that it does not know.
@@ -121,6 +123,11 @@ def to_geodetic(
                 "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
             )
         first, second = (y, x) if _counts_north_first(crs) else (x, y)
+        if _is_exchanged(crs, change, first, second):
+            raise CaptureError(
+                f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} lie where {crs.name} ({where}) is used only "
+                "once x and y change places. Write x (east) first, or under its name: easting, northing."
+            )
         if flat:  # heights are kept, whatever they are measured from
             latitude, longitude = change.transform(first, second)
             z = z * up
@@ -155,6 +162,24 @@ def unit_without_heights(header: str) -> float:
 
 def _unit_without_heights(crs: Any) -> float:
     return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0
+
+
+def _is_exchanged(crs: Any, change: Any, first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether places [n] lie where a projected system is used only once their coordinates are exchanged, and far from
+    there as they are."""
+    if not crs.is_projected or not len(first):
+        return False
+    area = next((part.area_of_use for part in (crs, *crs.sub_crs_list) if part.area_of_use is not None), None)
+    if area is None or area.west > area.east:
+        return False
+
+    def is_near(place: tuple[float, ...]) -> bool:
+        latitude, longitude = place[:2]
+        north_south = area.south - BESIDE_DEG <= latitude <= area.north + BESIDE_DEG
+        return north_south and area.west - BESIDE_DEG <= longitude <= area.east + BESIDE_DEG
+
+    one, other, height = float(np.median(first)), float(np.median(second)), () if len(crs.axis_info) == 2 else (0.0,)
+    return not is_near(change.transform(one, other, *height)) and is_near(change.transform(other, one, *height))
 
 
 def _counts_north_first(crs: Any) -> bool:
@@ -193,7 +218,7 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
         if datum.name == "unknown":  # `to_geodetic` says so
             return UNKNOWN_DATUM_M, ""
         return UNKNOWN_DATUM_M, (
-            f"PROJ knows no shift from {datum.name} to WGS 84 there: taken as of WGS 84 (may be off by "
+            f"taken as of WGS 84, for PROJ knows no shift from {datum.name} there (may be off by "
             f"{UNKNOWN_DATUM_M:.0f} m)"
         )
     moved = np.abs(np.subtract(way.transform(longitude, latitude), (longitude, latitude))).max()

@@ -112,7 +112,7 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
     """
     lookup = NameLookup((name, index) for index, name in enumerate(names))
     if numbered:
-        found = _best_rows(names, rows, _by_number(names), file)
+        found = _best_rows(names, rows, _by_number(names), file, numbered)
     else:
         found = _best_rows(names, rows, lookup.find, file) or _best_rows(names, rows, lookup.find_elsewhere, file)
     if not found:
@@ -123,7 +123,9 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
     return dict(sorted(found.items()))
 
 
-def _best_rows(names: Sequence[str], rows: Sequence[GpsRow], find: _Find, file: Path) -> dict[int, GpsRow]:
+def _best_rows(
+    names: Sequence[str], rows: Sequence[GpsRow], find: _Find, file: Path, numbered: bool = False
+) -> dict[int, GpsRow]:
     """For each image that rows name, by its index, the row that names it best."""
     named: dict[int, list[tuple[tuple[int, int], list[int], GpsRow]]] = {}
     for row in rows:
@@ -135,13 +137,18 @@ def _best_rows(names: Sequence[str], rows: Sequence[GpsRow], find: _Find, file: 
         best = min(rank for rank, _, _ in claims)
         (which, row), *others = [(which, row) for rank, which, row in claims if rank == best]
         if len(which) > 1:
-            raise CaptureError(
-                f"{file}: line {row.line}: {ambiguity_message(row.name, names[which[0]], names[which[1]])}"
+            one, other = names[which[0]], names[which[1]]
+            said = (
+                f"number {row.name} may be {one} or {other}: the drone writes such a file for one flight. Place the "
+                "flights one by one, or give one table name,lat,lon,alt of all."
+                if numbered
+                else ambiguity_message(row.name, one, other)
             )
-        other = next((each for _, each in others if not _same_place(each, row)), None)
-        if other is not None:
+            raise CaptureError(f"{file}: line {row.line}: {said}")
+        differs = next((each for _, each in others if not _same_place(each, row)), None)
+        if differs is not None:
             raise CaptureError(
-                f"{file}: lines {row.line} and {other.line} ({row.name!r}, {other.name!r}) give {names[index]} "
+                f"{file}: lines {row.line} and {differs.line} ({row.name!r}, {differs.name!r}) give {names[index]} "
                 "different positions. Keep its own row only; photographs of one name need their folders, in the table "
                 "and on disk."
             )

@@ -36,6 +36,7 @@ from vdgs.captures.table_columns import (
     known_columns,
     meters_of,
     number_of,
+    parted_angles,
     with_names,
 )
 from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
@@ -181,6 +182,11 @@ def _is_header(line: Line) -> bool:
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
     known = with_names(known_columns(rows[0].words), [row.words for row in rows[1:]])
+    if parts := parted_angles(rows[0].words):
+        raise CaptureError(
+            f"{file}: has minutes and seconds in columns of their own ({', '.join(map(repr, parts))}). Write each "
+            "angle into one column: name,lat,lon,alt with degrees such as -33.51234, or words such as 33 30 44.4 S."
+        )
     unit = meters_of(rows[0].words[known["alt"]]) if "alt" in known else 1.0
     others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
     heights = (rows[0].words[known["alt"]], *others) if others else ()

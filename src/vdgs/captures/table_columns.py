@@ -27,11 +27,11 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "latitudewgs84 ylat cameralatitude originallatitude breite breitengrad latitud latitudine 纬度",
         "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
         "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude lange langengrad "
-        "longitud longitudine 经度",
+        "laenge laengengrad longitud longitudine 经度",
         "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
         "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
         "heightellipsoid ellh hell hmsl hae "
-        "elevationm altft altitudeft altitudefeet heightft hohe altitud altura quota 高度 海拔",
+        "elevationm altft altitudeft altitudefeet heightft hohe hoehe altitud altura quota 高度 海拔",
         "x": "x pointx "
         "easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
         "y": "y pointy northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
@@ -79,6 +79,9 @@ _PARTS = re.compile(r"[\[( _](mm|cm|km)\b", re.IGNORECASE)
 ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
 RADIANS = re.compile(r"[\[( _]rad(?:ians)?\b", re.IGNORECASE)
 
+#: Columns of minutes and of seconds beside one of degrees: lat_min, Longitude (sec), lat_m.
+_PARTED = re.compile(r"(?:gps)?(lat|lon|lng)[a-z]*[\W_]+(min(?:ute)?s?|sec(?:ond)?s?|m|s)\b\W*", re.IGNORECASE)
+
 #: What programs write where they know nothing.
 UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
 
@@ -114,6 +117,16 @@ def with_names(known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[
         if words and (labels or all(PurePosixPath(word).suffix.lower() in _PICTURES for word in words)):
             return {**known, "name": k}
     return dict(known)
+
+
+def parted_angles(words: Sequence[str]) -> list[str]:
+    """Those of these names of columns that hold minutes or seconds of angles whose degrees have a column of their own;
+    `m` and `s` alone, which may mean metres and a deviation, only where both are there."""
+    found = [(word, match[2].lower()) for word in words if (match := _PARTED.fullmatch(word.strip()))]
+    units = {unit for _, unit in found}
+    if any("max" in word.lower() for word in words):  # lat_min is the least of them then
+        return []
+    return [word for word, unit in found if len(unit) > 1 or {"m", "s"} <= units]
 
 
 def has_time(words: Sequence[str]) -> bool:

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
+from math import comb
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import fdtrc
 
 #: Points whose second principal spread is below this share of the first lie on one line.
 MAX_COLLINEAR_RATIO = 0.02
+#: Of so few points a robust standard deviation is no guide, as three of them fit anything. Points are left out there
+#: where chance would let any as many stand out this seldom, and where each is so many standard deviations off (choice).
+FEW_POINTS, SIGNIFICANT, OUTLIER_SIGMAS = 30, 0.0005, 7.0
+#: One axis has a variance of its own where chance would make one of three so much worse this seldom (choice).
+WORSE_AXIS = 0.005
+#: A similarity of space has so many parameters.
+PARAMETERS = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,33 +62,114 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
 def fit_similarity_robust(
     source: np.ndarray, target: np.ndarray, num_iterations: int = 500
 ) -> tuple[Similarity, np.ndarray]:
-    """Least median of squares over seeded triples, then least squares over the inliers.
+    """Least median of squares over triples, all of them or seeded ones, then least squares over the inliers.
 
-    Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit,
-    refined twice. Returns the similarity and the inliers [n] bool. The draws are seeded by a constant, so
-    that the same capture always gets the same frame.
+    Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit, refined twice;
+    of few points all are inliers but those that stand out by an F test. Returns the similarity and the inliers [n]
+    bool. The draws are seeded by a constant, so that the same capture always gets the same frame.
     """
-    generator = np.random.default_rng(0)
     best = fit_similarity(source, target)
     best_median = np.median(_residuals(best, source, target))
-    for _ in range(num_iterations):
-        triple = generator.choice(len(source), size=3, replace=False)
+    for triple in _triples(len(source), num_iterations):
         if is_collinear(source[triple]):
             continue
         candidate = fit_similarity(source[triple], target[triple])
         median = np.median(_residuals(candidate, source, target))
         if median < best_median:
             best, best_median = candidate, median
+    # The floor keeps exact data (residuals 0) from losing points to rounding.
+    floor = 1e-9 * (1 + np.abs(target).max())
+    if len(source) <= FEW_POINTS:
+        inliers = _without_outliers(source, target, best, floor)
+        return fit_similarity(source[inliers], target[inliers]), inliers
     inliers = np.ones(len(source), bool)
     for _ in range(3):
         residuals = _residuals(best, source, target)
-        # The floor keeps exact data (median residual 0) from losing points to rounding.
-        floor = 1e-9 * (1 + np.abs(target).max())
         inliers = residuals <= max(3 * 1.4826 * float(np.median(residuals)), floor)
         if is_collinear(source[inliers]):
             return fit_similarity(source, target), np.ones(len(source), bool)
         best = fit_similarity(source[inliers], target[inliers])
     return best, inliers
+
+
+def _triples(count: int, most: int) -> Iterator[np.ndarray]:
+    """All triples of so many points where they are not more than `most`, else so many draws."""
+    if comb(count, 3) <= most:
+        yield from map(np.array, combinations(range(count), 3))
+        return
+    generator = np.random.default_rng(0)
+    for _ in range(most):
+        yield generator.choice(count, size=3, replace=False)
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What a similarity to some points leaves of them."""
+
+    squares: float
+    """Summed over points and axes; infinite where the points fix no similarity."""
+    worst: float = 0.0
+    """Those along the axis that has most."""
+    nearest: float = 0.0
+    """How far the nearest of the other points is from it."""
+
+    def variance(self, count: int, floor: float) -> tuple[float, float]:
+        """Of the worst axis of so many points, and how many observations are free to tell it: those of all axes, unless
+        that one is plainly worse than the others, as heights are where a model is bent."""
+        free = 3 * count - PARAMETERS
+        alone, rest = 3 * self.worst / free, 1.5 * max(self.squares - self.worst, floor**2) / free
+        if 3 * fdtrc(free / 3, 2 * free / 3, alone / rest) < WORSE_AXIS:
+            return max(alone, floor**2), free / 3
+        return max(alone, floor**2 / free), free
+
+
+def _without_outliers(source: np.ndarray, target: np.ndarray, start: Similarity, floor: float) -> np.ndarray:
+    """All of few points, [n] bool, but for the fewest of them after which no more stand out by an F test.
+
+    For each number of points those count that least trimmed squares keep, begun at `start` and at one point more.
+    """
+    count = len(source)
+    kept = [np.ones(count, bool)]
+    left = [_left(source, target, kept[0])]
+    for number in range(count - 1, max(3, count // 2), -1):
+        begun = (start, fit_similarity(source[kept[-1]], target[kept[-1]]))
+        found = [_trimmed(source, target, each, number) for each in begun]
+        facts = [_left(source, target, each) for each in found]
+        best = min((0, 1), key=lambda k: facts[k].squares)
+        kept.append(found[best])
+        left.append(facts[best])
+
+    def stand_out(few: int, more: int) -> bool:
+        variance, free = left[more].variance(count - more, floor)
+        changed = 3 * (more - few)
+        ratio = (left[few].squares - left[more].squares) / changed / variance
+        chance = comb(count - few, more - few) * fdtrc(changed, free, max(0.0, ratio))
+        return bool(chance < SIGNIFICANT and left[more].nearest > OUTLIER_SIGMAS * np.sqrt(variance))
+
+    numbers = range(len(kept))
+    return next(kept[few] for few in numbers if not any(stand_out(few, more) for more in numbers[few + 1 :]))
+
+
+def _trimmed(source: np.ndarray, target: np.ndarray, start: Similarity, number: int) -> np.ndarray:
+    """So many points, [n] bool, that a similarity fits with least squares: those nearest to the fit, again and again
+    (the concentration steps of least trimmed squares)."""
+    kept = np.ones(len(source), bool)
+    for _ in range(10):
+        before, kept = kept, np.zeros(len(source), bool)
+        kept[np.argsort(_residuals(start, source, target), kind="stable")[:number]] = True
+        if (kept == before).all():
+            break
+        start = fit_similarity(source[kept], target[kept])
+    return kept
+
+
+def _left(source: np.ndarray, target: np.ndarray, kept: np.ndarray) -> _Left:
+    if is_collinear(source[kept]):
+        return _Left(float("inf"))
+    off = fit_similarity(source[kept], target[kept]).apply(source) - target
+    squares = np.linalg.eigvalsh(off[kept].T @ off[kept])
+    others = np.linalg.norm(off[~kept], axis=1)
+    return _Left(float(squares.sum()), float(squares[-1]), float(others.min(initial=np.inf)))
 
 
 def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -32,6 +32,8 @@ SENSOR, EQUIVALENT = "EXIF's focal length and sensor", "EXIF's 35 mm equivalent"
 AGREE = 1.25
 #: Sides of a picture whose proportions differ by more than this share were cut.
 CUT = 0.02
+#: Programs that shrink photographs leave less of them than this share of the longer side (choice).
+MAX_SHRUNK = 0.6
 #: A digital zoom beyond this is damage.
 LARGEST_ZOOM = 100.0
 
@@ -50,6 +52,8 @@ class Lens:
     """EXIF's FocalLength."""
     zoom_confirmed: bool = False
     """Whether the 35 mm equivalent has the zoom in it, where EXIF's FocalLength has not."""
+    remark: str = ""
+    """What is assumed of it, where that is likely enough to hold it."""
 
 
 def read_lens(
@@ -60,7 +64,7 @@ def read_lens(
     Each is held against the others, and what contradicts most of them is not taken.
     """
     longer = max(width, height)
-    original, cut = _original(details, width, height)
+    original, cut, unclear = _original(details, width, height)
     model, zoom = _model(tags), _zoom(details)
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
     kept = zoom * (original / longer if cut else 1.0)  # a picture that was cut has fewer pixels, of the same size
@@ -79,7 +83,10 @@ def read_lens(
         return None
     focal, source, doubt = _agreed(known, longer, copied=equivalent_mm == focal_mm)
     confirmed = as_written is not None and _alike(as_written, focal) and not _alike(as_written, focal / zoom)
-    return Lens(focal, source, doubt, 1.0 if source == EQUIVALENT else zoom, focal_mm, confirmed)
+    if unclear and not cut:
+        doubt = "; ".join(filter(None, (unclear, doubt)))
+    zoom = 1.0 if source == EQUIVALENT else zoom
+    return Lens(focal, source, doubt, zoom, focal_mm, confirmed, remark=unclear if cut else "")
 
 
 def unzoomed(lens: Lens) -> Lens:
@@ -137,14 +144,22 @@ def _zoomed_equivalent(equivalent: float | None, others: Sequence[float | None],
     return min((equivalent, equivalent * zoom), key=lambda each: abs(math.log(each / known)))
 
 
-def _original(details: Mapping[int, Any], width: int, height: int) -> tuple[float, bool]:
-    """The longer side in pixels as the camera took it, and whether the picture was cut from it, not shrunk."""
+def _original(details: Mapping[int, Any], width: int, height: int) -> tuple[float, bool, str]:
+    """The longer side in pixels as the camera took it; whether the picture was cut from it, not shrunk; and what leaves
+    that open: a picture of another shape, shorter on both sides, may be both cut and shrunk. Where it is nearly as long
+    as it was, it is taken as cut only: few programs shrink by so little."""
     sides = sorted(_number(details.get(tag)) or 0.0 for tag in (0xA002, 0xA003))
     shorter, longer = sorted((width, height))
     if not sides[1]:
-        return float(longer), False
+        return float(longer), False, ""
     other_shape = sides[0] > 0 and abs(sides[1] / sides[0] * shorter / longer - 1) > CUT
-    return sides[1], other_shape and bool({*sides} & {shorter, longer})
+    if not other_shape or {*sides} & {shorter, longer} or shorter > sides[0] or longer > sides[1]:
+        return sides[1], other_shape and bool({*sides} & {shorter, longer}), ""
+    cut = longer > MAX_SHRUNK * sides[1]
+    return sides[1], cut, (
+        f"of another shape than EXIF says ({width} x {height} px of {sides[1]:.0f} x {sides[0]:.0f}): it was cut, and "
+        f"perhaps shrunk; the focal length is taken as if it was {'cut only' if cut else 'shrunk'}"
+    )  # fmt: skip
 
 
 def _times(focal: float | None, factor: float) -> float | None:

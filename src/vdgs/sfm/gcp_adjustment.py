@@ -21,6 +21,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 
 #: With so many points, one that does not fit the others is found and left out.
 MIN_POINTS_FOR_OUTLIERS = 6
+#: Heights, which are often worse than places, have an accuracy of their own where a plane leaves so many free.
+FREE_HEIGHTS = 2
 #: A mark is right to about so many pixels: what is farther off counts less.
 MARK_SIGMA_PX = 2.0
 #: A mark so many pixels from where the model puts a surveyed point is wrong; points whose marks are farther off than
@@ -190,12 +192,12 @@ def adjust_to_gcps(
     known = np.isfinite(targets[rows, 2])
     is_level = is_collinear(places[known])  # too few heights
     aims = _with_heights(places, targets[rows], is_level, level)
-    similarity, trusted = _fit_to_gcps(places, aims)
+    similarity, trusted = fit_to_gcps(places, aims)
     said = doubts(similarity, places[trusted], aims[trusted]) if doubts is not None else ""
     if said:
         raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
     transform_model(model, similarity)
-    accuracy = _accuracy(similarity.apply(places[trusted]), aims[trusted], int(known[trusted].sum()))
+    accuracy = gcp_accuracy(similarity.apply(places[trusted]), aims[trusted], int(known[trusted].sum()))
     notes: tuple[str, ...] = ()
     kept, firm = rows[trusted].tolist(), rows[trusted & known].tolist()
     if is_level:
@@ -290,13 +292,16 @@ def _with_heights(
         elif level.gps is not None:
             heights += np.median(level.gps.apply(places)[:, 2] - heights)
     else:
-        heights = _fit_to_gcps(places[known], targets[known])[0].apply(places)[:, 2]
+        heights = fit_to_gcps(places[known], targets[known])[0].apply(places)[:, 2]
     measured = targets if not is_level else np.full_like(targets, np.nan)  # all heights there are by one plane
     return np.column_stack([targets[:, :2], np.where(np.isfinite(measured[:, 2]), targets[:, 2], heights)])
 
 
-def _accuracy(placed: np.ndarray, targets: np.ndarray, heights: int) -> AccuracyFacts:
-    """What 95 % stay below, from what a similarity to the points leaves, of which so many have measured heights."""
+def gcp_accuracy(placed: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], heights: int) -> AccuracyFacts:
+    """What 95 % stay below, from what a similarity to the points leaves, of which so many have measured heights.
+
+    `placed` [n, 3] are the points as the similarity has them, `targets` [n, 3] as they were surveyed.
+    """
     off, count = placed - targets, len(targets)
     free = max(1, 2 * count + heights - (7 if heights >= MIN_CONTROL_POINTS else 4))
     times = float(stdtrit(free, 0.975))
@@ -305,11 +310,15 @@ def _accuracy(placed: np.ndarray, targets: np.ndarray, heights: int) -> Accuracy
     scale = times * deviation / float(np.sqrt((spread**2).sum()))
     across = float(np.hypot(spread[0], spread[1]))
     middle = times * deviation / np.sqrt(count)
+    up, upright = middle, times * deviation
+    if heights - 3 >= FREE_HEIGHTS:
+        alone = float(stdtrit(heights - 3, 0.975)) * float(np.sqrt((off[:, 2] ** 2).sum() / (heights - 3)))
+        up, upright = max(up, alone / np.sqrt(count)), max(upright, alone)
     edge = float(np.linalg.norm(targets - targets.mean(axis=0), axis=1).max())
     return AccuracyFacts(
-        place_m=(float(np.sqrt(2) * middle), float(middle)), scale_percent=100 * scale, scale_m=scale * edge,
+        place_m=(float(np.sqrt(2) * middle), float(up)), scale_percent=100 * scale, scale_m=scale * edge,
         north_deg=float(np.degrees(times * deviation / across)),
-        level_deg=float(np.degrees(times * deviation / max(float(spread[1]), 1e-9))), positions_m=None,
+        level_deg=float(np.degrees(upright / max(float(spread[1]), 1e-9))), positions_m=None,
     )  # fmt: skip
 
 
@@ -338,7 +347,8 @@ def _triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int,
     return {k: seen for k, seen in found if seen is not None}
 
 
-def _fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:
+def fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:
+    """The similarity from points of a model to where they were surveyed, and which of them it counts, [n] bool."""
     if len(points) < MIN_POINTS_FOR_OUTLIERS:
         return fit_similarity(points, targets), np.ones(len(points), bool)
     return fit_similarity_robust(points, targets)

@@ -24,15 +24,18 @@ from vdgs.system.units import two_digits
 MIN_ATTITUDES = 3
 #: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
 MIN_HEADING_SPREAD = 0.3
-#: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, are no
-#: measurements (choice).
-SCATTER_DEG, CONTRADICT_DEG = 20.0, 45.0
+#: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, and by so
+#: many standard deviations of it, are no measurements (choice).
+SCATTER_DEG, CONTRADICT_DEG, CONTRADICT_SIGMAS = 20.0, 45.0, 3.0
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
 #: Recorded headings count from so many on that agree so well (mean of unit vectors); the other way round is so far.
 ENOUGH_HEADINGS, ALIKE, OTHER_WAY_DEG = 5, 0.95, 150.0
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
+#: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
+#: distance is found of about so many photographs.
+MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
 ADVICE_WRITE_GPS = (
     "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
     "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
@@ -88,7 +91,7 @@ def georegister(
     images = {image.name: image for image in model.images.values() if image.has_pose}
     rows, centers, targets = _match_positions(images, images_metadata, positions)
     if not positions.usable or len(rows) < MIN_POSITIONS:
-        few = f"{len(positions)} positions, of placed photographs, are too few"
+        few = f"{len(rows)} positions of placed photographs are too few, {MIN_POSITIONS} are needed"
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
     up, notes = up_of(model, images_metadata)
     taken = [images_metadata[int(positions.image_indices[row])] for row in rows]
@@ -110,10 +113,12 @@ def georegister(
             "be its own mirror image, or upside down. Are latitude and longitude exchanged, or is a hemisphere (S, W, "
             f"a minus sign) missing? {ANYWAY}"
         )
-    levelled, offsets = _without_offsets(problem, positions, rows)
+    far = _viewing_distance(list(images.values()), model)
+    levelled, offsets = _without_offsets(problem, positions, rows, far)
     fit, barometer = _best_fit(levelled, taken)
+    elsewhere = _elsewhere(fit, far)
     if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
-        offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers, positions.flights[rows])
+        offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
@@ -121,6 +126,7 @@ def georegister(
     notes += [f"{refused}; used all the same, as asked for."] if refused else []
     notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
     how = _method(fit, barometer, is_nearly_collinear(targets, positions.gps_std[rows]), positions.source, up.how)
+    notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += _of_altitudes(fit, barometer) + _of_north(fit.similarity, images, taken)
     return Georegistration(
@@ -163,15 +169,45 @@ def accuracy_of(
     )  # fmt: skip
 
 
+def _viewing_distance(images: Sequence[pycolmap.Image], model: pycolmap.Reconstruction) -> float:
+    """How far from the cameras lies what they see, in the model's unit: the median of some photographs."""
+    depths = []
+    for image in images[:: max(1, len(images) // VIEWS_LOOKED_AT)]:
+        seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+        if seen:
+            depths.append(float(np.median(np.linalg.norm(np.array(seen) - image.projection_center(), axis=1))))
+    return float(np.median(depths)) if depths else float("inf")
+
+
+def _elsewhere(fit: PositionFit, far: float) -> np.ndarray:
+    """Which positions lie farther across from where the photographs put them than the cameras see, [n] bool: if the
+    positions are right, the photographs show another place."""
+    return ~fit.inliers & (np.linalg.norm(fit.residuals[:, :2], axis=1) > fit.similarity.scale * far)
+
+
+def _of_elsewhere(fit: PositionFit, elsewhere: np.ndarray, far_m: float) -> list[str]:
+    if elsewhere.sum() < MIN_ELSEWHERE:
+        return []
+    off = float(np.median(np.linalg.norm(fit.residuals[elsewhere, :2], axis=1)))
+    return [
+        f"{elsewhere.sum()} of {len(elsewhere)} positions lie about {two_digits(off)} m from where the photographs put "
+        f"them, {two_digits(off / far_m)} times as far as the cameras see; these positions are not used. Either they "
+        "are wrong, or places that look alike were taken for one and the scene is wrong there: look at "
+        "reconstruction.png, and reconstruct such flights one by one."
+    ]
+
+
 def _without_offsets(
-    problem: Problem, positions: GpsPriors, rows: np.ndarray
+    problem: Problem, positions: GpsPriors, rows: np.ndarray, far: float = float("inf")
 ) -> tuple[Problem, AltitudeOffsets | None]:
     """The problem with all altitudes from one datum, and what was left out, where flights differ and one datum explains
-    the photographs better. Places in the plane alone tell it."""
+    the photographs better. Places in the plane alone tell it, but none that is farther from its position than cameras
+    see (`far`, in the model's unit)."""
     if not problem.has_altitudes or len(positions.flights) != len(positions) or not np.ptp(positions.flights[rows]):
         return problem, None
     plane = fit_positions(replace(problem, has_altitudes=False))
-    flights, up = positions.flights[rows], positions.gps_std[rows, 2]
+    none = -1 - np.arange(len(rows))  # a flight of its own
+    flights, up = np.where(_elsewhere(plane, far), none, positions.flights[rows]), positions.gps_std[rows, 2]
     offsets = altitude_offsets(plane.placed, problem.targets, flights, problem.up.deviation_deg, up)
     if offsets is None or np.abs(offsets.different).max() <= positions.altitude_step_m:
         return problem, None
@@ -312,7 +348,8 @@ def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
     apart = float(np.degrees(np.arccos(np.clip(mean @ direction, -1, 1))))
     level = rotation_to_z(mean)
     tilt, several = _tilt(rotations @ level.T, down)
-    if scatter > SCATTER_DEG or (sure and not several and apart > CONTRADICT_DEG):
+    most = max(CONTRADICT_DEG, CONTRADICT_SIGMAS * views.deviation_deg)
+    if scatter > SCATTER_DEG or (sure and not several and apart > most):
         return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
     found = level.T @ np.append(-tilt, 1.0)
     deviation = float(np.hypot(scatter / np.sqrt(len(seen)), HANGS_DEG if several else HANGS_ALIKE_DEG))

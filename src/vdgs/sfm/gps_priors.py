@@ -280,8 +280,8 @@ def _or_nan(value: float | None) -> float:
 
 def _unmatched(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], table: Path) -> list[str]:
     """What to say of rows that are of no photograph."""
-    used = {row.line for row in found.values()}
-    spare = list(dict.fromkeys(row.name for row in rows if row.line not in used))
+    used = {row.name for row in found.values()}  # rows that say the same of a photograph twice are no others
+    spare = list(dict.fromkeys(row.name for row in rows if row.name not in used))
     if not spare:
         return []
     return [f"{table.name}: {len(spare)} rows are of photographs that are not there; left out ({first_names(spare)})."]

@@ -287,7 +287,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         attitude=attitude if orientation == 1 else None,
         file_bytes=size,
         has_alpha_channel=found.has_alpha_channel,
-        doubts=tuple(filter(None, (unclear, datum, default, lens.doubt if lens else ""))),
+        doubts=tuple(filter(None, (unclear, datum, default, *((lens.doubt, lens.remark) if lens else ())))),
         whole=found.whole,
         kind=found.kind,
         band=band_of(name, found.mode, xmp),

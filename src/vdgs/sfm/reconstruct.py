@@ -53,6 +53,7 @@ from vdgs.sfm.reconstruction_plan import (
 from vdgs.sfm.reconstruction_report import (
     ReconstructionResult,
     cameras_of,
+    check_enough_placed,
     exclusion_reasons,
     lens_moved,
     make_reconstruction_report,
@@ -228,6 +229,7 @@ def _steps(
         feature_matching.count_verified_matches(workspace),
         lost,
     )
+    check_enough_placed(models[0], left_out)
     mapped = pycolmap.Reconstruction(models[0])
     found = georeference(models[0], plan, held[0])
     _write(plan, workspace, mapped, found.model, keys["capture"], console)

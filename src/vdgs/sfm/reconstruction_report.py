@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vdgs.captures.capture_dates import first_and_last
+from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
+from vdgs.errors import CaptureError
 from vdgs.sfm.camera_rigs import describe_rigs
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
@@ -16,7 +18,7 @@ from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
 from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_points, tilt_from_attitudes
 from vdgs.sfm.gps_priors import GpsPriors
-from vdgs.sfm.image_list import ExcludedImage, ImageList
+from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.incremental_mapper import refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -122,6 +124,16 @@ def exclusion_reasons(
         )
         found.append(ExcludedImage(name, reasons.get(name, why)))
     return found
+
+
+def check_enough_placed(model: pycolmap.Reconstruction, left_out: Sequence[ExcludedImage]) -> None:
+    """Raise CaptureError for a model of fewer photographs than a scene needs."""
+    placed = len(placed_images(model))
+    if placed < MIN_IMAGES:
+        raise CaptureError(
+            f"only {placed} photographs could be joined; a scene needs {MIN_IMAGES} at the very least. Let photographs "
+            f"overlap by 70 to 80 %, the camera moving between them.{format_list([each.line for each in left_out])}"
+        )
 
 
 def _altitudes(prepared: ReconstructionPlan) -> str:

@@ -56,7 +56,7 @@ class Telemetry:
 def read_subtitles(text: str) -> list[tuple[float, str]]:
     """The blocks of a file of subtitles (.SRT): when each begins, in seconds, and its words."""
     marks = list(_TIMES.finditer(text))
-    ends = [mark.start() for mark in marks[1:]] + [len(text)]
+    ends = ([mark.start() for mark in marks] + [len(text)])[1:]
     return [
         (3600 * int(mark[1]) + 60 * int(mark[2]) + int(mark[3]) + int(mark[4].ljust(3, "0")) / 1000,
          text[mark.end() : end])
