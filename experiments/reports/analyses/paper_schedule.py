@@ -1,7 +1,7 @@
 """The preset `paper` on one capture to its end, on validation views, with steps scaled down.
 
     python -m experiments.reports.analyses.paper_schedule DATA WORK             # three values of tau, eight blocks
-    python -m experiments.reports.analyses.paper_schedule DATA WORK --crossed   # cut x compensation, four blocks
+    python -m experiments.reports.analyses.paper_schedule DATA WORK --crossed [--seed 1]   # cut x compensation, four blocks
 
 One coarse model of seneca is trained; each row cuts a copy of it into blocks, trains, merges and measures them. Rows are
 kept in WORK/schedule.jsonl: the same command continues. Test photographs are left out.
@@ -73,13 +73,13 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join([*scene, "", *blocks]) + "\n"
 
 
-def main(data: Path, work: Path, wanted: dict[str, Changes]) -> list[dict[str, Any]]:
+def main(data: Path, work: Path, wanted: dict[str, Changes], seed: int) -> list[dict[str, Any]]:
     """The rows of these names; those that are there are kept."""
     work.mkdir(parents=True, exist_ok=True)
     file, coarse = work / "schedule.jsonl", RunFolder(work / "coarse")
     rows = {row["row"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
     if wanted.keys() - rows:
-        call("train-coarse", data / "seneca", *COARSE, "--output", coarse.path, "--quiet")
+        call("train-coarse", data / "seneca", *COARSE, "--seed", str(seed), "--output", coarse.path, "--quiet")
         call("visibility", coarse.path, "--quiet")
         call("eval", coarse.path, "--model", "coarse", "--quiet")
     for name, changes in wanted.items():
@@ -93,6 +93,7 @@ if __name__ == "__main__":
     parser.add_argument("data", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--crossed", action="store_true")
+    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     print(describe())
-    print(as_markdown(main(options.data, options.work, CROSSED if options.crossed else BY_TAU)))
+    print(as_markdown(main(options.data, options.work, CROSSED if options.crossed else BY_TAU, options.seed)))
