@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from rich.console import Console
 
 pycolmap = pytest.importorskip("pycolmap")
 
+from vdgs.errors import VdgsError  # noqa: E402
 from vdgs.geometry.similarity import fit_similarity  # noqa: E402
-from vdgs.sfm import global_mapper, incremental_mapper  # noqa: E402
+from vdgs.sfm import global_mapper, incremental_mapper, reconstruct  # noqa: E402
 from vdgs.sfm.feature_matching import count_verified_matches  # noqa: E402
 from vdgs.sfm.workspace import Workspace, silence_colmap  # noqa: E402
 
@@ -93,14 +99,97 @@ def test_parts_that_few_points_join_become_one_model(tmp_path):
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02 * ALTITUDE
 
 
-@pytest.mark.parametrize("why", ["no model", "another shape"])
-def test_parts_stay_where_all_at_once_is_no_better(tmp_path, monkeypatch, why):
-    workspace = workspace_of(tmp_path / "work", 24)
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory) -> Path:
+    """The work folder of such a flight in two parts. Not to be changed: `copied`."""
+    workspace = workspace_of(tmp_path_factory.mktemp("mapped") / "work", 24)
     incremental_mapper.run_mapper(workspace, 16, True, 1, CONSOLE)
-    before = sizes(workspace)
+    assert sizes(workspace) == [8, 8]
+    return workspace.path
+
+
+@pytest.fixture
+def copied(mapped, tmp_path) -> Workspace:
+    shutil.copytree(mapped, tmp_path / "work")
+    workspace = Workspace(tmp_path / "work")
+    workspace.begin("model", "key")
+    workspace.finish("model", "key")
+    return workspace
+
+
+def models_of(workspace: Workspace, key: str = "key") -> list[int]:
+    """As `vdgs sfm` makes them, or goes on with them."""
+    plan = SimpleNamespace(image_list=SimpleNamespace(images=[]), threads=1)
+    return [len(model.images) for model in reconstruct._models(plan, workspace, key, 16, True, CONSOLE)]
+
+
+@pytest.mark.parametrize("why", ["no model", "another shape"])
+def test_parts_stay_where_all_at_once_is_no_better(copied, monkeypatch, why):
     if why == "no model":
         monkeypatch.setattr(global_mapper.sys, "executable", "false")
     else:
         monkeypatch.setattr(global_mapper, "MAX_MOVED_SHARE", 0.0)
-    join(workspace)
-    assert sizes(workspace) == before == [8, 8]
+    said = Console(record=True, width=200, file=io.StringIO())
+    incremental_mapper.set_models_aside(copied)
+    global_mapper.place_left_out(copied, 16, True, 1, said)
+    assert sizes(copied) == [8, 8]
+    assert f"all photographs at once: the {'mapper ended without a model' if why == 'no model' else 'part of 8'}" in (
+        said.export_text()
+    )
+    assert not list(copied.path.glob("global-*"))
+
+
+def interrupt(*_: object) -> str:
+    raise KeyboardInterrupt
+
+
+def test_work_that_stops_while_parts_are_joined_goes_on(copied, monkeypatch):
+    incremental_mapper.set_models_aside(copied)  # killed before the step is noted
+    assert sizes(copied) == [8, 8]
+    with monkeypatch.context() as stopped:
+        stopped.setattr(global_mapper, "_take", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            models_of(copied)
+    assert copied.is_begun("joined", "key")
+    assert models_of(copied) == [16]
+    assert copied.is_done("joined", "key")
+    copied.forget("joined")
+    assert not copied.is_begun("joined", "key")
+    assert copied.is_done("model", "key")
+
+
+def test_models_that_are_made_anew_are_joined_anew(copied):
+    assert models_of(copied) == [16]
+    copied.begin("model", "other")  # another focal length was asked for, and the work was stopped
+    assert models_of(copied) == [16]
+    assert copied.is_done("joined", "key")
+
+
+def test_a_model_that_the_disk_cut_off_is_not_taken(copied, tmp_path):
+    """COLMAP says nothing where it can write a part of a model only."""
+    program = tmp_path / "python"
+    program.write_text(f"#!/bin/sh\ncp -r {copied.models}/0 $5/0\ntruncate -s 100 $5/0/points3D.bin\n")
+    program.chmod(0o755)
+    incremental_mapper.set_models_aside(copied)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(global_mapper.sys, "executable", str(program))
+        with pytest.raises(VdgsError, match="could write a part only"):
+            global_mapper.place_left_out(copied, 16, True, 1, CONSOLE)
+    assert not list(copied.saved_snapshots.glob("*"))
+    global_mapper.place_left_out(copied, 16, True, 1, CONSOLE)
+    assert sizes(copied) == [16]
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_a_part_on_one_line_keeps_its_shape_but_where_it_is_bent(copied, bent):
+    part, joined = (incremental_mapper.read_models(copied)[0] for _ in range(2))
+    for model in (part, joined):  # one strip of the two
+        for image in list(model.images.values()):
+            if int(image.name[:2]) % 2:
+                model.deregister_frame(image.frame_id)
+    if bent:
+        image = next(image for image in joined.images.values() if image.has_pose)
+        pose = image.frame.rig_from_world
+        pose.translation = pose.translation + 0.2 * incremental_mapper.height_over_points(image, joined) * np.eye(3)[2]
+        image.frame.rig_from_world = pose
+    assert global_mapper._keeps_shape(part, joined) is not bent

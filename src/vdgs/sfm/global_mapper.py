@@ -12,19 +12,23 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
+import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
-from vdgs.captures.formats.colmap_writing import write_model_files
-from vdgs.geometry.similarity import fit_similarity_robust
+from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
+from vdgs.errors import CaptureError
 from vdgs.sfm import feature_matching, incremental_mapper
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.image_metadata import EXACT_MODEL
 from vdgs.sfm.workspace import Workspace, report_progress
+from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -55,54 +59,77 @@ def leaves_photographs_out(workspace: Workspace) -> bool:
 
 def place_left_out(workspace: Workspace, count: int, fix_focal: bool, threads: int, console: Console) -> None:
     """Make models again, beginning with all photographs at once; those that were set aside (`set_models_aside`) are
-    taken back where that places no more photographs, or where it changes the shape of a part."""
+    taken back, and why is said, where that places no more photographs, or changes the shape of a part.
+
+    Raises VdgsError for a full disk.
+    """
     parts = incremental_mapper.read_models(workspace, aside=True)
-    if _map_globally(workspace, count, len(placed_images(parts[0])), fix_focal, threads, console):
-        incremental_mapper.run_mapper(workspace, count, fix_focal, threads, console)
-        joined = incremental_mapper.read_models(workspace)[0]
-        _leave_weak_out(joined)
-        with_shape = [part for part in parts if len(placed_images(part)) >= MIN_PART]
-        if (
-            len(placed_images(joined)) > len(placed_images(parts[0]))
-            and joined.compute_mean_reprojection_error() <= MAX_ERROR_PX
-            and all(_keeps_shape(part, joined) for part in with_shape)
-        ):
-            shutil.rmtree(workspace.models)
-            write_model_files(joined, workspace.models / "0")
-            return
-    incremental_mapper.take_models_back(workspace)
+    try:
+        why = _map_globally(workspace, count, len(placed_images(parts[0])), fix_focal, threads, console)
+        if not why:
+            incremental_mapper.run_mapper(workspace, count, fix_focal, threads, console)
+            why = _take(workspace, parts)
+    except CaptureError as error:  # of COLMAP
+        why = str(error)
+    if why:
+        said = f"all photographs at once: {escape(why)}; the parts stay as they are"
+        console.print(f"[yellow]note[/] {said}", highlight=False)
+        incremental_mapper.take_models_back(workspace)
+
+
+def _take(workspace: Workspace, parts: Sequence[pycolmap.Reconstruction]) -> str:
+    """Keep the largest model alone, which takes the place of parts; why not, or empty."""
+    joined = incremental_mapper.read_models(workspace)[0]
+    for image in placed_images(joined):
+        if image.num_points3D < MIN_POINTS:
+            joined.deregister_frame(image.frame_id)
+    why = _why_not(parts, joined)
+    if not why:
+        shutil.rmtree(workspace.models)
+        write_model_files(joined, workspace.models / "0")
+    return why
 
 
 def _map_globally(
     workspace: Workspace, count: int, placed: int, fix_focal: bool, threads: int, console: Console
-) -> bool:
-    """Put the largest model of the global mapper where the incremental one goes on from. False where there is none."""
+) -> str:
+    """Let the incremental mapper go on from the largest model of the global one; why there is none, or empty."""
     if any(workspace.saved_snapshots.glob("*")):
-        return True
-    folder = workspace.path / "global"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    with report_progress(workspace, console, "mapping", count, f"{placed} placed, now all at once, ") as tell:
-        tell(placed)
-        # In a process of its own: the global mapper cannot be interrupted, and a failed check of it ends a process.
-        arguments = (workspace.database, workspace.images, folder, threads, int(fix_focal))
+        return ""
+    # In a process of its own: the global mapper cannot be interrupted, and a failed check of it ends a process; and in
+    # a folder of its own, for such a process may outlive this one.
+    folder = Path(tempfile.mkdtemp(dir=workspace.path, prefix="global-"))
+    try:
+        with report_progress(workspace, console, "mapping", count, f"{placed} placed, now all at once, ") as tell:
+            tell(placed)
+            said = _run_apart((workspace.database, workspace.images, folder, threads, int(fix_focal)), folder / "log")
+        if said or not any(each.is_dir() for each in folder.iterdir()):
+            return f"the mapper ended without a model {said}".strip()
+        with explain_disk_errors(workspace.path):
+            sizes = {each: incremental_mapper.registered_count(each) for each in folder.iterdir() if each.is_dir()}
+            largest = max(sizes, key=lambda each: sizes[each])
+            check_whole_model(largest)
+        workspace.saved_snapshots.mkdir(exist_ok=True)
+        os.replace(largest, workspace.saved_snapshots / str(sizes[largest]))
+        return ""
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _run_apart(arguments: Sequence[object], log: Path) -> str:
+    """Run `map_globally` in a process of its own; what it said last where it failed."""
+    with log.open("wb") as output:
         command = [sys.executable, "-m", __name__, *map(str, arguments)]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            while process.poll() is None:
-                time.sleep(_POLL_SECONDS)
-                check_stop_requested()
-        finally:
-            process.kill()
-            process.wait()
-    sizes = {each: incremental_mapper.registered_count(each) for each in folder.iterdir() if each.is_dir()}
-    if process.returncode or not sizes:
-        return False
-    largest = max(sizes, key=lambda each: sizes[each])
-    workspace.saved_snapshots.mkdir(exist_ok=True)
-    os.replace(largest, workspace.saved_snapshots / str(sizes[largest]))
-    shutil.rmtree(folder)
-    return True
+        process = subprocess.Popen(command, stdout=output, stderr=output)
+    try:
+        while process.poll() is None:
+            time.sleep(_POLL_SECONDS)
+            check_stop_requested()
+    finally:
+        process.kill()
+        process.wait()
+    said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+    return f"({' '.join([f'exit code {process.returncode}', *said])})" if process.returncode else ""
 
 
 def map_globally(database: Path, images: Path, output: Path, threads: int, fix_focal: bool) -> None:
@@ -117,10 +144,16 @@ def map_globally(database: Path, images: Path, output: Path, threads: int, fix_f
     pycolmap.global_mapping(database, images, output, options)
 
 
-def _leave_weak_out(model: pycolmap.Reconstruction) -> None:
-    for image in list(placed_images(model)):
-        if image.num_points3D < MIN_POINTS:
-            model.deregister_frame(image.frame_id)
+def _why_not(parts: Sequence[pycolmap.Reconstruction], joined: pycolmap.Reconstruction) -> str:
+    """Why a model is not taken in place of its parts; empty where it is."""
+    if len(placed_images(joined)) <= len(placed_images(parts[0])):
+        return "no more are placed"
+    if joined.compute_mean_reprojection_error() > MAX_ERROR_PX:
+        return f"points are {joined.compute_mean_reprojection_error():.1f} px from where they should be"
+    for part in parts:
+        if len(placed_images(part)) >= MIN_PART and not _keeps_shape(part, joined):
+            return f"the part of {len(placed_images(part))} has another shape in it"
+    return ""
 
 
 def _keeps_shape(part: pycolmap.Reconstruction, joined: pycolmap.Reconstruction) -> bool:
@@ -130,15 +163,16 @@ def _keeps_shape(part: pycolmap.Reconstruction, joined: pycolmap.Reconstruction)
     if len(names) < max(3, (1 - MIN_MISSING_SHARE) * len(before)):
         return False
     centers, moved = (np.array([of[name].projection_center() for name in names]) for of in (before, after))
-    similarity, _ = fit_similarity_robust(moved, centers)
-    off = np.linalg.norm(similarity.apply(moved) - centers, axis=1)
-    away = np.median([incremental_mapper.height_over_points(before[name], part) for name in names])
-    turns = [
-        (before[name].cam_from_world().rotation.matrix() @ similarity.rotation).T
-        @ after[name].cam_from_world().rotation.matrix()
-        for name in names
-    ]
-    angles = np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    rotations = [np.array([of[name].cam_from_world().rotation.matrix() for name in names]) for of in (before, after)]
+    # By the rotations of the cameras, for their places leave it open where they lie on one line.
+    left, _, right = np.linalg.svd(np.einsum("nji,njk->ik", *rotations))
+    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    centers, moved = centers - centers.mean(axis=0), (moved - moved.mean(axis=0)) @ turn.T
+    off = np.linalg.norm(centers - (centers * moved).sum() / (moved**2).sum() * moved, axis=1)
+    cosines = (np.einsum("nij,jk,nik->n", rotations[0], turn, rotations[1]) - 1) / 2
+    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    seen = [before[name] for name in names if before[name].num_points3D]
+    away = np.median([incremental_mapper.height_over_points(image, part) for image in seen])
     worse = joined.compute_mean_reprojection_error() - part.compute_mean_reprojection_error()
     return bool(
         np.sqrt((off**2).mean()) <= MAX_MOVED_SHARE * away
@@ -151,5 +185,12 @@ def _by_name(images: Iterable[pycolmap.Image]) -> dict[str, pycolmap.Image]:
     return {image.name: image for image in images}
 
 
+def _end_with_parent(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_POLL_SECONDS)
+    os._exit(1)
+
+
 if __name__ == "__main__":
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     map_globally(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]), sys.argv[5] == "1")

@@ -225,10 +225,12 @@ def registered_count(folder: Path) -> int:
 
 
 def set_models_aside(workspace: Workspace) -> None:
-    """Keep the models of a first run of the mapper, for `read_models` and `take_models_back`, and begin anew."""
+    """Keep the models of a first run of the mapper, for `read_models` and `take_models_back`. They stay where they are
+    until the next run begins, for the work may stop in between."""
     shutil.rmtree(workspace.models_aside, ignore_errors=True)
     shutil.copytree(workspace.models, workspace.models_aside)
-    delete_models(workspace)
+    for folder in (workspace.snapshots, workspace.saved_snapshots):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def take_models_back(workspace: Workspace) -> None:

@@ -310,6 +310,7 @@ def _models(
     if not workspace.is_done("model", key):
         if not workspace.is_begun("model", key):
             incremental_mapper.delete_models(workspace)
+            workspace.forget("joined", "rigs")
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
         workspace.finish("model", key)

@@ -76,7 +76,7 @@ class Workspace:
 
     @property
     def models_aside(self) -> Path:
-        """Models without rigs, where rigs are told by them."""
+        """Models of a first run of the mapper, while a second one may make better ones."""
         return self.path / "loose"
 
     @property
@@ -101,6 +101,13 @@ class Workspace:
 
     def finish(self, step: str, key: str) -> None:
         self._note("done", step, key)
+
+    def forget(self, *steps: str) -> None:
+        """Take steps for not begun: what they worked on is made anew."""
+        known = {name: self._steps(name) for name in ("begun", "done")}
+        write_json(self.path / STEPS_FILE, {
+            name: {step: key for step, key in noted.items() if step not in steps} for name, noted in known.items()
+        })  # fmt: skip
 
     @contextmanager
     def open_database(self) -> Iterator[pycolmap.Database]:
