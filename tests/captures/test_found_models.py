@@ -193,6 +193,7 @@ def test_a_kind_of_files_is_named_once(tmp_path):
     for number in range(3):
         (tmp_path / f"{number}.json").write_text('{"t_00": 1.0, "t_01": 0.0, "t_02": 0.0, "fx": 900}')
     (tmp_path / "run.log").write_text("12 photographs of 3 flights\n 1 2 3\n")
+    (tmp_path / "other.log").write_text(f"1 2 3\n2026-11-27-21-00\n{'-' * 5000}\n> start\n")  # no pattern hangs on it
     assert [note.partition(":")[0] for note in foreign_poses(tmp_path)] == ["0.json"]
 
 

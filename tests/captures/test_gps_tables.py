@@ -485,6 +485,32 @@ def test_x_and_y_that_only_fit_where_their_system_is_used_once_exchanged_are_ref
     assert len(read_gps_table(file).rows) == 1
 
 
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("name,lat,lon,alt,latency_sec", "a.jpg,-33.5,-70.6,500,2"),
+        ("name,lat,lon,alt,lateral (min),max_dop", "a.jpg,-33.5,-70.6,500,2,3"),
+        ("name,lat,lon,alt,lat_min,lat_max", "a.jpg,-33.5,-70.6,500,-34,-33"),
+        ("name,easting,northing,z,lat_deg,lat_min,lat_sec", f"a.jpg,{EASTING},{NORTHING},500,-33,30,0"),
+    ],
+)
+def test_columns_that_are_no_minutes_of_the_angles_that_are_read(tmp_path, header, row):
+    system = "EPSG:32719\n" if "easting" in header else ""
+    (tmp_path / "t.csv").write_text(f"{system}{header}\n{row}\n")
+    assert read_gps_table(tmp_path / "t.csv").rows[0].position == pytest.approx(PLACE, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("code", "x", "y", "place"),
+    [
+        ("EPSG:32661", 2572730, 426438, (75, 20)), ("EPSG:32761", 2572730, 3573562, (-75, 20)),
+        ("EPSG:31467", 3500000, 5500000, (49.64, 9.0)), ("EPSG:3413", 100000, -2000000, (71.67, -42.14)),
+    ],
+)  # fmt: skip
+def test_east_comes_first_in_systems_of_all_axes(tmp_path, code, x, y, place):
+    assert to_geodetic(code, tmp_path)[0](np.array([[x, y, 5.0]]))[0, :2] == pytest.approx(place, abs=0.01)
+
+
 @pytest.mark.parametrize("axes", ["", ',AXIS["Lat",NORTH],AXIS["Lon",EAST]', ',AXIS["Lon",EAST],AXIS["Lat",NORTH]'])
 @pytest.mark.parametrize("heights", [False, True])
 @pytest.mark.parametrize("shift", ["", "TOWGS84[0,0,0,0,0,0,0],"])

@@ -176,6 +176,9 @@ def test_test_frames_of_scannetpp_are_tested_on(tmp_path, scene):
     assert_sees_the_scene(capture, scene)
     assert [view.split for view in capture.views] == ["train"] * 8 + ["test"] * 4
     assert capture.warnings == ()
+    content["val_filenames"] = [content["frames"][0]["file_path"]]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert [view.split for view in load_capture(tmp_path).views] == ["test"] + ["train"] * 7 + ["test"] * 4
     content["test_frames"] = "none"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(CaptureError, match=r"must hold a list 'test_frames'"):

@@ -259,6 +259,14 @@ def test_transforms_without_points_keep_their_poses_and_lists(
     own = read_posed_photographs(request, CaptureOptions())
     assert [own.views[k].view.name for k in own.trained] == [flight.names[k] for k in (0, 3, 5, 6)]
     assert own.validation == {flight.names[4]}
+    (tmp_path / "mine.txt").write_text(f"{flight.names[0]}\n")
+    mine = read_posed_photographs(request, CaptureOptions(test_list=tmp_path / "mine.txt"))
+    assert [mine.views[k].view.name for k in mine.trained] == [flight.names[k] for k in (1, 2, 3, 5, 6)]
+    (tmp_path / "set" / "test.txt").write_text(f"{flight.names[2]}\n")
+    (tmp_path / "set" / "validation.txt").write_text(f"{flight.names[1]}\n{flight.names[4]}\n")
+    moved = read_posed_photographs(request, CaptureOptions())
+    assert moved.trained == own.trained
+    assert moved.keys["capture"] != own.keys["capture"]
 
 
 @pytest.mark.usefixtures("few_features")

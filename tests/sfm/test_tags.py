@@ -274,7 +274,9 @@ DETAILS = {0x920A: 8.5, 0xA002: 400, 0xA003: 300, 0xA20E: 40.0, 0xA210: 4}
         pytest.param({0xA405: 30}, (200, 300), 340 / 300, SENSOR, False, id="cut at the sides"),
         pytest.param({0xA405: 30}, (320, 250), 340 / 320, SENSOR, False, id="cut on all sides"),
         pytest.param({0xA405: 30}, (250, 320), 340 / 320, SENSOR, False, id="cut on all sides, upright"),
-        pytest.param({0xA405: 30}, (160, 90), 0.85, SENSOR, True, id="cut and shrunk"),
+        pytest.param({0xA405: 30}, (160, 100), 0.85, SENSOR, True, id="cut and shrunk"),
+        pytest.param({0xA405: 30}, (280, 158), 0.85, SENSOR, False, id="exported in 16:9"),
+        pytest.param({0xA405: 30}, (270, 180), 0.85, SENSOR, False, id="exported in 3:2"),
         pytest.param({0xA405: 30}, (160, 119), 0.85, SENSOR, False, id="shrunk, rounded"),
     ],
 )

@@ -106,7 +106,7 @@ def to_geodetic(
     try:
         crs = pyproj.CRS.from_user_input(_named(header))
         flat = len(crs.axis_info) == 2
-        change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979")
+        change = _to_latitude(crs, "EPSG:4326" if flat else "EPSG:4979")
         up = _unit_without_heights(crs) if heights_as_xy else 1.0
     except pyproj.exceptions.ProjError:
         raise UnknownSystem(
@@ -122,18 +122,13 @@ def to_geodetic(
                 f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} look like degrees, but {crs.name} ({where}) "
                 "counts in metres. Write the system that they are of, such as EPSG:4326 with longitude before latitude."
             )
-        first, second = (y, x) if _counts_north_first(crs) else (x, y)
-        if _is_exchanged(crs, change, first, second):
+        if _is_exchanged(crs, change, x, y):
             raise CaptureError(
                 f"{file}: coordinates such as {x[0]:.10g}, {y[0]:.10g} lie where {crs.name} ({where}) is used only "
                 "once x and y change places. Write x (east) first, or under its name: easting, northing."
             )
-        if flat:  # heights are kept, whatever they are measured from
-            latitude, longitude = change.transform(first, second)
-            z = z * up
-        else:
-            latitude, longitude, z = change.transform(first, second, z)
-        return np.stack([latitude, longitude, z], axis=1)
+        latitude, longitude, *heights = change(x, y) if flat else change(x, y, z)
+        return np.stack([latitude, longitude, *heights, *([z * up] if flat else [])], axis=1)  # whatever z is over
 
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
@@ -164,10 +159,32 @@ def _unit_without_heights(crs: Any) -> float:
     return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0
 
 
-def _is_exchanged(crs: Any, change: Any, first: np.ndarray, second: np.ndarray) -> bool:
+def _to_latitude(crs: Any, target: str) -> Callable[..., tuple[Any, ...]]:
+    """What brings x, y and, of three axes, z of a system to latitude, longitude and height of `target`.
+
+    `always_xy` of pyproj does not see that latitude is first where a system with heights holds one with TOWGS84, as
+    Metashape writes it.
+    """
+    import pyproj
+
+    unseen = crs.is_compound and any(part.is_bound for part in crs.sub_crs_list)
+    north_first = [axis.direction.lower() for axis in crs.axis_info[:2]] == ["north", "east"]
+    if unseen and north_first:
+        change = pyproj.Transformer.from_crs(crs, target)
+        return lambda x, y, *z: change.transform(y, x, *z)
+    change = pyproj.Transformer.from_crs(crs, target, always_xy=True)
+
+    def changed(x: Any, y: Any, *z: Any) -> tuple[Any, ...]:
+        longitude, latitude, *height = change.transform(x, y, *z)
+        return latitude, longitude, *height
+
+    return changed
+
+
+def _is_exchanged(crs: Any, change: Callable[..., tuple[Any, ...]], x: np.ndarray, y: np.ndarray) -> bool:
     """Whether places [n] lie where a projected system is used only once their coordinates are exchanged, and far from
     there as they are."""
-    if not crs.is_projected or not len(first):
+    if not crs.is_projected or not len(x):
         return False
     area = next((part.area_of_use for part in (crs, *crs.sub_crs_list) if part.area_of_use is not None), None)
     if area is None or area.west > area.east:
@@ -178,14 +195,8 @@ def _is_exchanged(crs: Any, change: Any, first: np.ndarray, second: np.ndarray) 
         north_south = area.south - BESIDE_DEG <= latitude <= area.north + BESIDE_DEG
         return north_south and area.west - BESIDE_DEG <= longitude <= area.east + BESIDE_DEG
 
-    one, other, height = float(np.median(first)), float(np.median(second)), () if len(crs.axis_info) == 2 else (0.0,)
-    return not is_near(change.transform(one, other, *height)) and is_near(change.transform(other, one, *height))
-
-
-def _counts_north_first(crs: Any) -> bool:
-    """Whether the first axis of a system is north and the second east. (`always_xy` of pyproj does not see it where a
-    system with heights holds one with TOWGS84, as Metashape writes it.)"""
-    return [axis.direction.lower() for axis in crs.axis_info[:2]] == ["north", "east"]
+    one, other, height = float(np.median(x)), float(np.median(y)), () if len(crs.axis_info) == 2 else (0.0,)
+    return not is_near(change(one, other, *height)) and is_near(change(other, one, *height))
 
 
 def _says_its_shift(crs: Any) -> bool:

@@ -182,7 +182,7 @@ def _is_header(line: Line) -> bool:
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
     known = with_names(known_columns(rows[0].words), [row.words for row in rows[1:]])
-    if parts := parted_angles(rows[0].words):
+    if {"lat", "lon"} <= set(known) and (parts := parted_angles(rows[0].words)):
         raise CaptureError(
             f"{file}: has minutes and seconds in columns of their own ({', '.join(map(repr, parts))}). Write each "
             "angle into one column: name,lat,lon,alt with degrees such as -33.51234, or words such as 33 30 44.4 S."

@@ -90,7 +90,7 @@ _BY_CONTENT = (
     (".txt", rb"\A# *kapture format", _KAPTURE),
     (".txt", rb"\A\s*extrinsic\s", "cameras of MVSNet; the COLMAP model that they were made of is read"),
     (
-        ".log", rb"\A\s*\d+ +\d+ +\d+\s*\n(\s*[-+.\de]+){16}\s",
+        ".log", rb"\A\s*\d+ +\d+ +\d+\s*\n(?:[-+.\de]+\s+){16}",
         "poses of Tanks and Temples without lenses; the COLMAP model that they were made of is read",
     ),
     (

@@ -81,11 +81,11 @@ def assign_splits(
 def held_out_by_capture(
     root: Path, names: Sequence[str], options: CaptureOptions, warnings: list[str]
 ) -> dict[str, set[str]]:
-    """The photographs that a capture's own lists keep from training, by the names of the lists."""
-    found = dict[str, set[str]]()
-    for name in (TEST_LIST, VALIDATION_LIST):
-        file = _list_of(root, name)
-        if file is not None and options.split != "every":
+    """The photographs that `--test-list` or a capture's own lists keep from training, by the names of the lists."""
+    found, files = dict[str, set[str]](), {VALIDATION_LIST: _list_of(root, VALIDATION_LIST)}
+    files[TEST_LIST] = options.test_list or _list_of(root, TEST_LIST)
+    for name, file in files.items():
+        if file is not None and options.split not in ("every", *_BY_FLIGHT):
             found[name], notes = listed_photographs(file, names, some=name == TEST_LIST, strict=options.strict)
             warnings += notes
     return found

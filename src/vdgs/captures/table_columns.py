@@ -80,7 +80,9 @@ ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
 RADIANS = re.compile(r"[\[( _]rad(?:ians)?\b", re.IGNORECASE)
 
 #: Columns of minutes and of seconds beside one of degrees: lat_min, Longitude (sec), lat_m.
-_PARTED = re.compile(r"(?:gps)?(lat|lon|lng)[a-z]*[\W_]+(min(?:ute)?s?|sec(?:ond)?s?|m|s)\b\W*", re.IGNORECASE)
+_ANGLE = r"(?:gps)?(lat(?:itude)?|lon(?:g(?:itude)?)?|lng)[\W_]+"
+_PARTED = re.compile(_ANGLE + r"(min(?:ute)?s?|sec(?:ond)?s?|m|s)\b\W*", re.IGNORECASE)
+_LARGEST = re.compile(_ANGLE + r"max", re.IGNORECASE)
 
 #: What programs write where they know nothing.
 UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
@@ -124,7 +126,7 @@ def parted_angles(words: Sequence[str]) -> list[str]:
     `m` and `s` alone, which may mean metres and a deviation, only where both are there."""
     found = [(word, match[2].lower()) for word in words if (match := _PARTED.fullmatch(word.strip()))]
     units = {unit for _, unit in found}
-    if any("max" in word.lower() for word in words):  # lat_min is the least of them then
+    if any(_LARGEST.match(word.strip()) for word in words):  # lat_min is the least of them then
         return []
     return [word for word, unit in found if len(unit) > 1 or {"m", "s"} <= units]
 

@@ -32,6 +32,8 @@ SENSOR, EQUIVALENT = "EXIF's focal length and sensor", "EXIF's 35 mm equivalent"
 AGREE = 1.25
 #: Sides of a picture whose proportions differ by more than this share were cut.
 CUT = 0.02
+#: Shapes that programs export: longer side over shorter.
+USUAL_SHAPES = (16 / 9, 3 / 2, 4 / 3, 1.0)
 #: Programs that shrink photographs leave less of them than this share of the longer side (choice).
 MAX_SHRUNK = 0.6
 #: A digital zoom beyond this is damage.
@@ -146,8 +148,8 @@ def _zoomed_equivalent(equivalent: float | None, others: Sequence[float | None],
 
 def _original(details: Mapping[int, Any], width: int, height: int) -> tuple[float, bool, str]:
     """The longer side in pixels as the camera took it; whether the picture was cut from it, not shrunk; and what leaves
-    that open: a picture of another shape, shorter on both sides, may be both cut and shrunk. Where it is nearly as long
-    as it was, it is taken as cut only: few programs shrink by so little."""
+    that open: a picture of another shape, shorter on both sides, may be both cut and shrunk. One of a usual shape was
+    exported, over the whole width or height. Of others, one that is nearly as long as it was is taken as cut only."""
     sides = sorted(_number(details.get(tag)) or 0.0 for tag in (0xA002, 0xA003))
     shorter, longer = sorted((width, height))
     if not sides[1]:
@@ -155,6 +157,8 @@ def _original(details: Mapping[int, Any], width: int, height: int) -> tuple[floa
     other_shape = sides[0] > 0 and abs(sides[1] / sides[0] * shorter / longer - 1) > CUT
     if not other_shape or {*sides} & {shorter, longer} or shorter > sides[0] or longer > sides[1]:
         return sides[1], other_shape and bool({*sides} & {shorter, longer}), ""
+    if any(abs(longer / shorter / shape - 1) < CUT / 2 for shape in USUAL_SHAPES):
+        return sides[1], False, ""
     cut = longer > MAX_SHRUNK * sides[1]
     return sides[1], cut, (
         f"of another shape than EXIF says ({width} x {height} px of {sides[1]:.0f} x {sides[0]:.0f}): it was cut, and "

@@ -78,8 +78,12 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
     views, _ = match_images(root, source, options, warnings)
     lists = held_out_by_capture(root, [view.view.name for view in views], options, warnings)
     views = sorted(_listed(views, lists, options, warnings), key=lambda view: view.view.name)
-    if sum(view.view.split != "test" for view in views) < 3:
-        raise CaptureError(f"{path}: {len(views)} photographs with a pose are there; points need 3 at the very least.")
+    training = sum(view.view.split != "test" for view in views)
+    if training < 3:
+        raise CaptureError(
+            f"{path}: {len(views)} photographs with a pose are there, {training} of them to train on; points need 3 at "
+            "the very least."
+        )
     on_white = source.source == "matrixcity" and source.georef is None  # not the city: sets of Blender
     transparent = sum(map(_has_alpha, views))
     if transparent and source.source in READERS:
@@ -87,12 +91,14 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
         warnings.append(f"{transparent} photographs are transparent: what is transparent {what}.")
     return PosedPhotographs(
         source=source, views=tuple(views), pinholes=_pinholes([view.file.intrinsics for view in views]),
-        keys=_keys(request, source, views), warnings=(*source.warnings, *warnings),
+        keys=_keys(request, source, views, lists), warnings=(*source.warnings, *warnings),
         on_white=bool(on_white and transparent), validation=frozenset(lists.get(VALIDATION_LIST, ())),
     )  # fmt: skip
 
 
-def _keys(request: SfmRequest, source: SourceCapture, views: Sequence[MatchedView]) -> dict[str, str]:
+def _keys(
+    request: SfmRequest, source: SourceCapture, views: Sequence[MatchedView], lists: Mapping[str, set[str]]
+) -> dict[str, str]:
     files, lenses = [_fingerprint(view) for view in views], [view.file.intrinsics for view in views]
     chosen = request.options
     found = cache_key(files, chosen.max_image_size, chosen.max_num_features)
@@ -102,7 +108,10 @@ def _keys(request: SfmRequest, source: SourceCapture, views: Sequence[MatchedVie
     splits = [view.view.split for view in views]
     matched = cache_key(straight, chosen.num_neighbors, *([splits] if any(splits) else []))
     keys = {FEATURES: found, BENT: straight, MATCHES: matched, POINTS: matched}
-    keys[CAPTURE] = cache_key(matched, chosen.max_output_size, source.georef and vars(source.georef))
+    validation = sorted(lists.get(VALIDATION_LIST, ()))
+    keys[CAPTURE] = cache_key(
+        matched, chosen.max_output_size, source.georef and vars(source.georef), *([validation] if validation else [])
+    )
     return keys
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from vdgs.system.units import first_names
 
 #: What programs call the bands of color photographs, in lower case: one name for all, or three among others.
-_COLOR, _COLORS = {"visible", "rgb", "color"}, ({"red", "green", "blue"}, {"r", "g", "b"})
+_COLOR, _COLORS = {"visible", "rgb", "srgb", "color", "colour"}, ({"red", "green", "blue"}, {"r", "g", "b"})
 
 
 def color_cameras(cameras: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[list[bool], list[str]]:

@@ -20,6 +20,8 @@ def find_listed(
     which says `where` the list is, where a line may mean several, and where none means any, or where a person is
     `strict` one does not.
     """
+    if not names:
+        return set(), []
     lookup = NameLookup((name, name) for name in names)
     found = {line: lookup.find(line)[1] for line in written}
     for line, meant in found.items():

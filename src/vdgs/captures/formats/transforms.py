@@ -84,8 +84,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     count, frames = len(frames), [*frames, *held_out]
     photographs = _find_photographs([_file_path(frame, file) for frame in frames], file, root, options)
     names, chosen, notes = photographs.names, photographs.folder, photographs.notes
-    splits: dict[str, Split] = {name: "test" if k >= count else "train" for k, name in enumerate(names) if held_out}
-    splits |= _splits(content, names, file, options, notes)
+    splits = _splits(content, names, names[count:], file, options, notes)
     undo = _undo_applied(content, file)
     views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
     bad = dict[str, CaptureError]()
@@ -162,12 +161,16 @@ def _find_photographs(written: list[str], file: Path, root: Path, options: Captu
     images = [find_image(root, f"{chosen}/{short}" if chosen else short) for short in shorts]
     if options.images is not None and not any(images):
         there = find_images(root / chosen)
-        found = find_in_other_folders(written, there, root / chosen, notes)
-        if any(found):
-            names = [name or path for name, path in zip(found, written, strict=True)]
+        once = list(dict.fromkeys(written))
+        found = dict(zip(once, find_in_other_folders(once, there, root / chosen, notes), strict=True))
+        if any(found.values()):
+            names = [found[path] or path for path in written]
             return _Photographs(names, names, [there.get(name) for name in names], chosen, notes)
     if outside is not None:
-        raise CaptureError(f"{outside} Or say which folder they are in: --images FOLDER") from outside
+        where = (
+            "none of them is in the folder of --images" if options.images else "say which folder they are in: --images"
+        )
+        raise CaptureError(f"{outside} Or {where}.") from outside
     return _Photographs(names, shorts, images, chosen, notes)
 
 
@@ -194,15 +197,16 @@ def _image_folder(root: Path, named: str, options: CaptureOptions) -> tuple[str,
 
 
 def _splits(
-    content: JsonObject, names: list[str], file: Path, options: CaptureOptions, notes: list[str]
+    content: JsonObject, names: list[str], held_out: list[str], file: Path, options: CaptureOptions, notes: list[str]
 ) -> dict[str, Split]:
-    """Splits of frames (`names`) where train_filenames and val_filenames or test_filenames are given.
+    """Splits of frames (`names`) where some are test_frames (`held_out`), or where train_filenames and val_filenames or
+    test_filenames are given.
 
     Frames in no list have none; where one side has no list at all, it takes them (choice). Raises `CaptureError`
     where a list that is not ignored names no frame.
     """
-    splits: dict[str, Split] = {}
-    sides_listed = set[Split]()
+    splits: dict[str, Split] = dict.fromkeys(held_out, "test")
+    sides_listed: set[Split] = {"test"} if held_out else set()
     for key, side in SPLIT_LISTS:
         listed = content.get(key) or []
         if not isinstance(listed, list):
