@@ -167,10 +167,8 @@ def _find_photographs(written: list[str], file: Path, root: Path, options: Captu
             names = [found[path] or path for path in written]
             return _Photographs(names, names, [there.get(name) for name in names], chosen, notes)
     if outside is not None:
-        where = (
-            "none of them is in the folder of --images" if options.images else "say which folder they are in: --images"
-        )
-        raise CaptureError(f"{outside} Or {where}.") from outside
+        remedy = "Or say which folder they are in: --images FOLDER" if options.images is None else "Mend the paths."
+        raise CaptureError(f"{outside} {remedy}") from outside
     return _Photographs(names, shorts, images, chosen, notes)
 
 
