@@ -115,7 +115,7 @@ class RunFolder:
                 raise RunError(
                     f"{self.config_file}: this run was started with other settings:\n  "
                     + "\n  ".join(changed)
-                    + "\nGive the old settings to continue it, or another --output to start a new run."
+                    + "\nGive the old settings to continue it, or begin another run: vdgs run CAPTURE --output RUN"
                 )
             return
         self.check_output_empty()
@@ -157,7 +157,7 @@ class RunFolder:
                 f"{self.config_file}: other settings than this run has:\n  "
                 + "\n  ".join(changed)
                 + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old "
-                "settings to continue, or take another --output."
+                "settings to continue, or begin another run: vdgs run CAPTURE --output RUN"
             )
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
