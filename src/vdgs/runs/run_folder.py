@@ -127,12 +127,12 @@ class RunFolder:
             return
         known = {".lock", self._driver.name, *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
         if self.path.exists() and not self.path.is_dir():
-            raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
+            raise RunError(f"{self.path}: is a file. Choose a folder for the run.")
         files = self.path.iterdir() if self.path.exists() else ()
         if unknown := sorted(file.name for file in files if file.name not in known and file.suffix != ".tmp"):
             raise RunError(
                 f"{self.path}: holds other files ({', '.join(unknown[:3])}) and no config.yaml. "
-                "Choose an empty or a new folder for --output."
+                "Choose an empty or a new folder for the run."
             )
 
     def change_settings(self, settings: RunSettings, overwrite: bool, command: str | None = None) -> list[str]:
