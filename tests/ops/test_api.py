@@ -309,6 +309,9 @@ def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_p
         with pytest.raises(VdgsError, match=words):
             call()
     assert not any(tmp_path.iterdir())
+    (tmp_path / "link.ply").symlink_to(tmp_path / "gone.ply")
+    with pytest.raises(VdgsError, match=r"link\.ply: is a link to .*gone\.ply"):
+        vdgs.export(run, tmp_path / "link.ply")
     with pytest.raises(ValueError, match=r"visibility \[n\]"):
         vdgs.partition(points, counts[:9])
     with pytest.raises(TypeError, match="not list"):

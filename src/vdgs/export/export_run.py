@@ -18,7 +18,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from vdgs.captures.first_view import default_view
-from vdgs.captures.output_guard import check_not_among_inputs, check_output
+from vdgs.captures.output_guard import check_no_link, check_not_among_inputs, check_output
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
@@ -269,6 +269,7 @@ def _check_names(asked: ExportRequest) -> None:
     for path in paths:
         axes_for(path, asked)
         check_output(path)
+        check_no_link(path)
         registry.check_not_foreign(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
