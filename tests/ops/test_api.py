@@ -285,6 +285,8 @@ def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_p
         "seed is -1; it must be at least 0": lambda: vdgs.partition(points, counts, seed=-1),
         "balanced is 'yes'; it must be true or false": lambda: vdgs.partition(points, counts, balanced="yes"),
         "points must be finite, and 300 of 300 are not": lambda: vdgs.partition(points * np.nan, counts),
+        "points is empty": lambda: vdgs.partition(points[:0], counts[:0]),
+        "^400 blocks: the scene has only 300 distinct anchors": lambda: vdgs.partition(points, counts, num_blocks=400),
         "visibility must be whole numbers of cameras": lambda: vdgs.partition(points, counts * np.nan),
         "whole numbers of cameras, at least 0": lambda: vdgs.partition(points, -counts),
         "whole numbers of cameras, at least 0: ": lambda: vdgs.partition(points, counts / 10),  # ratios are no counts

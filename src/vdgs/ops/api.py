@@ -265,6 +265,8 @@ def partition(
     )
     if places.ndim != 2 or places.shape[1] != 3 or counts.shape != places.shape[:1]:
         raise ValueError(f"points must be [n, 3] and visibility [n], not {places.shape} and {counts.shape}")
+    if not len(places):
+        raise VdgsError("points is empty: there is nothing to cut into blocks")
     if not np.isfinite(places).all():
         wrong = int((~np.isfinite(places)).any(axis=1).sum())
         raise VdgsError(f"points must be finite, and {wrong} of {len(places)} are not: leave them out")
