@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from rich.console import Console
 from support.captures import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from support.commands import vdgs
 from vdgs.captures.formats.colmap_records import MAX_OBSERVATIONS
-from vdgs.captures.image_checks import check_images, detect_rounding
+from vdgs.captures.image_checks import END_BYTES, check_images, detect_rounding, find_copies
 from vdgs.captures.loading import load_capture
 from vdgs.captures.validation import require_valid, validate_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -283,6 +284,25 @@ def test_photographs_that_show_nothing(folder, scene):
         cv2.imwrite(str(folder / "images" / name), np.zeros((48, 64, 4), np.uint8))
     with pytest.raises(CaptureError, match="is transparent everywhere"):
         check_images(load_capture(folder))
+
+
+def test_copies_of_a_photograph_under_other_names_are_told(folder, scene):
+    names, images = list(scene.cameras), folder / "images"
+    assert not check_images(load_capture(folder)).warnings
+    for one, copy in ((0, 3), (0, 7), (1, 4)):
+        shutil.copyfile(images / names[one], images / names[copy])
+    told = check_images(load_capture(folder)).warnings
+    assert len(told) == 1
+    assert told[0].startswith("5 photographs are the same file as another one")
+    assert f"({names[0]} = {names[3]} = {names[7]}, {names[1]} = {names[4]})" in told[0]
+
+
+def test_files_of_one_length_and_the_same_ends_are_no_copies(folder, scene):
+    """Pictures without compression all have one length, and often the same border."""
+    views = load_capture(folder).views[:3]
+    for view, middle in zip(views, (b"a", b"b", b"a"), strict=True):
+        view.image_path.write_bytes(bytes(END_BYTES) + middle + bytes(END_BYTES))
+    assert find_copies(views) == [(views[0].name, views[2].name)]
 
 
 def test_sizes_that_do_not_fit_the_rest(folder, scene):

@@ -112,6 +112,15 @@ def test_a_verb_names_an_option_that_it_lacks_only_with_those_that_have_it(verb)
         assert lacked == set(OPTION.findall(note)), f"vdgs {verb}: {fitted}"
 
 
+def test_what_all_verbs_say_of_a_run_is_said_as_a_command():
+    """Few verbs have --output, and `view` no --capture: what a run says of itself, any verb may print."""
+    for file, text in texts_with_options():
+        of_run = file.startswith("runs/") and file != "runs/settings_file.py"  # which `vdgs config` writes
+        if " " in text and (of_run or file == "captures/capture_metadata.py"):
+            outside = COMMAND.sub("", text)
+            assert not {"--output", "--capture"} & set(OPTION.findall(outside)), f"{file}: {text}"
+
+
 def test_advice_is_fitted_to_the_verb():
     fit = Advice("run", all_arguments).fit
     assert fit("Leave the positions out: --georeference off") == "Leave the positions out: --sfm.georeference off"

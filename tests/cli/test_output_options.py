@@ -65,6 +65,16 @@ def test_the_known_outputs_are_found() -> None:
 @pytest.mark.parametrize(("verb", "option"), WRITTEN, ids=[f"{verb} {option.flag}" for verb, option in WRITTEN])
 def test_no_verb_writes_among_photographs(verb: str, option: Option, inside: str, card: Path, capsys) -> None:
     before, root = contents(card.parents[1]), card.parents[1].parent
+    write_to(card / inside, verb, option, root)
+    said = capsys.readouterr().err
+    assert "lies among the photographs" in said
+    assert str(card.parents[1] / "") in said.split("such as")[1]
+    assert contents(card.parents[1]) == before
+    assert sorted(root.iterdir()) == [root / "card", root / "empty"]
+
+
+def write_to(place: Path, verb: str, option: Option, root: Path) -> None:
+    """Let a verb write to a place, which it must refuse before it looks at its run or capture."""
     (root / "empty").mkdir()
     (root / "empty" / "config.yaml").touch()  # neither a capture nor a run, which is not looked at yet
     arguments = (
@@ -72,15 +82,20 @@ def test_no_verb_writes_among_photographs(verb: str, option: Option, inside: str
     )
     if option.flag != "--output":
         arguments += [] if verb in ("render", "ortho", "export", "view") else ["--output", str(root / "free")]
-    place = str(card / inside)
     with pytest.raises(SystemExit) as ended:
-        main([verb, *arguments, *([place] if option.is_positional else [option.flag, place])])
+        main([verb, *arguments, *([str(place)] if option.is_positional else [option.flag, str(place)])])
     assert ended.value.code == 1
-    said = capsys.readouterr().err
-    assert "lies among the photographs" in said
-    assert str(card.parents[1] / "") in said.split("such as")[1]
-    assert contents(card.parents[1]) == before
-    assert sorted(root.iterdir()) == [root / "card", root / "empty"]
+
+
+@pytest.mark.parametrize("target", ["there.ply", "gone.ply"])
+@pytest.mark.parametrize(("verb", "option"), WRITTEN, ids=[f"{verb} {option.flag}" for verb, option in WRITTEN])
+def test_no_verb_writes_over_a_link_to_a_file(verb: str, option: Option, target: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "there.ply").write_text("of another program")
+    (tmp_path / "link.ply").symlink_to(target)
+    write_to(tmp_path / "link.ply", verb, option, tmp_path)
+    assert f"link.ply: is a link to {target}, which the output would replace" in capsys.readouterr().err
+    assert (tmp_path / "link.ply").is_symlink()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["empty", "link.ply", "there.ply"]
 
 
 @pytest.mark.parametrize("verb", sorted({*COMMANDS} - {verb for verb, _ in WRITTEN} - {"doctor"}))

@@ -139,6 +139,10 @@ def test_a_block_trained_again_is_merged_again(unbroken, copied):
     shutil.rmtree(copied / "blocks/01")
     assert vdgs("merge", copied, "--allow-missing-blocks").returncode == 0
     assert model(copied) != model(unbroken)
+    again = vdgs("merge", copied)
+    assert again.returncode == 1
+    assert "block 1: not trained yet" in again.stderr
+    assert "nothing to do" in vdgs("merge", copied, "--allow-missing-blocks").stdout
     assert vdgs("train-blocks", copied, "--block", "1").returncode == 0
     assert vdgs("merge", copied).returncode == 0
     assert model(copied) == model(unbroken)

@@ -6,7 +6,7 @@ import ast
 import inspect
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,8 @@ import torch
 import vdgs
 from support.commands import CommandsHere, small_figures
 from support.small_pipeline import vdgs as verb
+from vdgs.config.presets import PRESETS
+from vdgs.config.validation_rules import checked_settings
 from vdgs.errors import CaptureError, RunError, VdgsError
 
 pytestmark = pytest.mark.xdist_group("api")
@@ -113,6 +115,37 @@ def test_cameras_are_made_of_matrices(run):
     for poses, intrinsics in ((camera.camera_from_world, K), (far[None], K[0]), (far[None], np.stack([K, K]))):
         with pytest.raises(ValueError, match="viewmats must be"):
             vdgs.cameras_from(poses, intrinsics, 4, 3)
+
+
+def test_matrices_that_make_no_camera_are_refused(run):
+    camera = run.scene.cameras[1]
+    pose = camera.camera_from_world
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    scaled, skewed, turned = pose.copy(), K.copy(), K.copy()
+    scaled[:3, :3] *= 2
+    skewed[0, 1], turned[1, 1] = 5, -camera.fy
+    mirrored = np.diag([1.0, 1.0, -1.0, 1.0]) @ pose
+    for wrong in (np.full((4, 4), np.nan), np.full((4, 4), np.inf), scaled, mirrored, pose.T):
+        with pytest.raises(VdgsError, match=r"viewmats\[1\] is no rotation and translation"):
+            vdgs.cameras_from(np.stack([pose, wrong]), K, 4, 3)
+    for wrong in (skewed, K.T, 2 * K, turned, 0 * K, K * np.nan):
+        for intrinsics in (wrong, np.stack([K, wrong])):
+            with pytest.raises(VdgsError, match=r"Ks holds .*with fx and fy above 0\. Transpose"):
+                vdgs.cameras_from(np.stack([pose, pose]), intrinsics, 4, 3)
+    for size in ((160.5, 3), (0, 3), (4, -3), ("4", 3), (4, None)):
+        with pytest.raises(VdgsError, match=r"(width|height) is .*it must be (a whole number|at least 1)"):
+            vdgs.cameras_from(pose[None], K, *size)
+    with pytest.raises(VdgsError, match="model is 'ortho'; it must be pinhole or orthographic"):
+        vdgs.cameras_from(pose[None], K, 4, 3, model="ortho")
+    made = vdgs.cameras_from(pose[None].astype(np.float32), K, np.int64(4), torch.tensor(3))[0]
+    assert (made.width, made.height, type(made.width)) == (4, 3, int)
+
+
+def test_presets_are_read_as_they_are():
+    """What `train` checks it does not change."""
+    for name in PRESETS:
+        preset = vdgs.preset(name)
+        assert checked_settings(type(preset), asdict(preset), "") == preset
 
 
 def test_visibility_is_counted_in_the_kind_that_is_given(coarse, native_small):
@@ -241,14 +274,32 @@ def test_what_does_not_work_is_said_before_any_work(capture, tmp_path):
 def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_path):
     points, counts = np.random.default_rng(0).uniform(0, 10, (300, 3)), np.full(300, 5)
     for words, call in {
-        "AssignmentConfig|threshold 7": lambda: vdgs.assign_cameras(
+        r"AssignmentConfig\.threshold is 7\.0; it must be at least 0 and at most 1": lambda: vdgs.assign_cameras(
             run.scene, run.blocks, run.scene.cameras, vdgs.AssignmentConfig(threshold=7.0)
         ),
-        "--lambda-vis -1": lambda: vdgs.partition(points, counts, lambda_vis=-1.0),
-        "--lambda-vis nan": lambda: vdgs.partition(points, counts, lambda_vis=float("nan")),
-        "--blocks 0": lambda: vdgs.partition(points, counts, num_blocks=0),
+        r"lambda_vis is -1\.0; it must be at least 0": lambda: vdgs.partition(points, counts, lambda_vis=-1.0),
+        "lambda_vis is nan": lambda: vdgs.partition(points, counts, lambda_vis=float("nan")),
+        "num_blocks is 0; it must be at least 1": lambda: vdgs.partition(points, counts, num_blocks=0),
+        r"num_blocks is 2\.5; it must be a whole number": lambda: vdgs.partition(points, counts, num_blocks=2.5),
+        "num_blocks is '2'; it must be a whole number": lambda: vdgs.partition(points, counts, num_blocks="2"),
+        "seed is -1; it must be at least 0": lambda: vdgs.partition(points, counts, seed=-1),
+        "balanced is 'yes'; it must be true or false": lambda: vdgs.partition(points, counts, balanced="yes"),
+        "points must be finite, and 300 of 300 are not": lambda: vdgs.partition(points * np.nan, counts),
+        "points is empty": lambda: vdgs.partition(points[:0], counts[:0]),
+        "^400 blocks: the scene has only 300 distinct anchors": lambda: vdgs.partition(points, counts, num_blocks=400),
+        "visibility must be whole numbers of cameras": lambda: vdgs.partition(points, counts * np.nan),
+        "whole numbers of cameras, at least 0": lambda: vdgs.partition(points, -counts),
+        "whole numbers of cameras, at least 0: ": lambda: vdgs.partition(points, counts / 10),  # ratios are no counts
+        r"CaptureOptions\.downscale is '2'; it must be a number": lambda: vdgs.load_capture(
+            capture.root, downscale="2"
+        ),
+        r"TrainConfig\.iterations is '3'; it must be a whole number": lambda: vdgs.train(
+            capture, replace(vdgs.preset().training, iterations="3")
+        ),
+        r"count is 2\.5; it must be a whole number": lambda: vdgs.configure_threads(2.5),
+        "count is -1; it must be at least 0": lambda: vdgs.configure_threads(-1),
         "sh_degree is 7; it must be 0 or 1": lambda: vdgs.export(run, tmp_path / "a.ply", sh_degree=7),
-        "--max-gaussians -1": lambda: vdgs.export(run, tmp_path / "a.ply", max_gaussians=-1),
+        r"export\.max_gaussians is -1; it must be": lambda: vdgs.export(run, tmp_path / "a.ply", max_gaussians=-1),
         "program is 'maya'": lambda: vdgs.export(run, tmp_path / "a.ply", program="maya"),
         "did you mean 'sh_degree'": lambda: vdgs.export(run, tmp_path / "a.ply", sh_degre=1),
         "rule is 'best'": lambda: vdgs.merge(run.scene, run.block_scenes, run.blocks, run.assignment, rule="best"),
@@ -260,6 +311,9 @@ def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_p
         with pytest.raises(VdgsError, match=words):
             call()
     assert not any(tmp_path.iterdir())
+    (tmp_path / "link.ply").symlink_to(tmp_path / "gone.ply")
+    with pytest.raises(VdgsError, match=r"link\.ply: is a link to .*gone\.ply"):
+        vdgs.export(run, tmp_path / "link.ply")
     with pytest.raises(ValueError, match=r"visibility \[n\]"):
         vdgs.partition(points, counts[:9])
     with pytest.raises(TypeError, match="not list"):
@@ -295,6 +349,11 @@ def test_wrong_kinds_of_arguments_are_named(capture, coarse):
         (lambda: vdgs.render(coarse, capture.views[0]), "camera must be vdgs.Camera, not View"),
         (lambda: vdgs.assign_cameras(points, None, cameras), "scene must be vdgs.Scene"),
         (lambda: vdgs.export(points, "x.ply"), "scene must be vdgs.Scene"),
+        (lambda: vdgs.assign_cameras(coarse, None, cameras, {}), "config must be vdgs.AssignmentConfig, not dict"),
+        (lambda: vdgs.train(capture, {"iterations": 3}), "config must be vdgs.MethodConfig or vdgs.TrainConfig, not d"),
+        (lambda: vdgs.train(capture, callbacks=print), "callbacks must be .*Iterable, not builtin.*: give a list of"),
+        (lambda: vdgs.train(capture, callbacks=[3]), "each of callbacks must be .*Callable, not int"),
+        (lambda: vdgs.train(capture.root, capture_options={}), "capture_options must be vdgs.CaptureOptions, not dict"),
     ):
         with pytest.raises(TypeError, match=name):
             call()

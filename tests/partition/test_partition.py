@@ -248,10 +248,10 @@ def test_weights_of_balanced_clusters_are_those_of_a_look_at_all_costs_in_each_s
 def test_anchors_that_cannot_be_cut_are_refused() -> None:
     three = np.repeat(np.array([[0.0, 0, 0], [5, 1, 0], [9, 0, 0]]), 4, axis=0)
     views = np.full(12, 3)
-    with pytest.raises(VdgsError, match=r"--blocks 4: .* only 3 distinct"):
+    with pytest.raises(VdgsError, match=r"^4 blocks: .* only 3 distinct"):
         cut(three, views, 4)
     stacked = np.column_stack([np.ones((12, 2)), np.arange(12.0)])
-    with pytest.raises(VdgsError, match=r"--blocks 2: .* only 1 distinct"):
+    with pytest.raises(VdgsError, match=r"^2 blocks: .* only 1 distinct"):
         cut(stacked, np.arange(12), 2)
     with pytest.raises(VdgsError, match="no anchors"):
         cut(np.zeros((0, 3)), np.zeros(0, int))

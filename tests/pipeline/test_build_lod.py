@@ -374,6 +374,14 @@ def coarse(model, tmp_path, monkeypatch) -> SimpleNamespace:
     return SimpleNamespace(run=run, capture=capture, location=location)
 
 
+def test_a_model_that_stands_in_for_the_merged_one_is_said(coarse, monkeypatch):
+    location = replace(coarse.location, warning="this is the coarse model, not the merged one: there is none yet")
+    monkeypatch.setattr(build_lod, "locate_model", lambda *_: location)
+    console = Console(record=True, width=200)
+    build_lod.build_lod(coarse, LodRequest(run=coarse.run.path), console)
+    assert f"warning {location.warning}" in console.export_text()
+
+
 def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
     console = Console(record=True)
     request = LodRequest(run=coarse.run.path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import shutil
 import sys
 from collections import namedtuple
@@ -13,8 +15,12 @@ import pytest
 from rich.console import Console
 
 from vdgs.config.commands import OrthoRequest
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
 from vdgs.rendering.ortho import map_status, ortho_plan, render_ortho, tile_renderer
+from vdgs.rendering.ortho.ortho_plan import OrthoPlan
+from vdgs.runs.open_run import ModelLocation
 from vdgs.runs.run_context import RunContext
 
 pytest.importorskip("rasterio")
@@ -118,6 +124,36 @@ def test_what_a_killed_command_left_goes_before_the_work_and_is_said(house, make
     ortho_folder = make(*house, gsd=0.5)
     assert {file.name for file in ortho_folder.iterdir()} == set(ortho_plan.FILE_NAMES)
     assert "removed what a killed command had left" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_model_that_stands_in_for_the_merged_one_is_said_and_noted(house, make, capsys):
+    stands_in = "this is the coarse model, not the merged one: there is none yet."
+    folder = make(*house, gsd=0.5, warning=stands_in)
+    assert f"warning {stands_in}" in " ".join(capsys.readouterr().err.split())
+    assert stands_in in json.loads((folder / "map.json").read_text())["notes"]
+    folder = make(*house, gsd=0.5)
+    assert "warning" not in capsys.readouterr().err
+    assert "coarse model" not in str(json.loads((folder / "map.json").read_text())["notes"])
+
+
+def test_shards_are_told_of_the_model_as_one_process_is(house, monkeypatch, tmp_path):
+    """What the two ways hand to the plan: the warning of the model that was found."""
+    plans, signature = list[dict[str, object]](), inspect.signature(OrthoPlan.of)
+
+    def plan(*given: object, **named: object) -> None:
+        plans.append(signature.bind(*given, **named).arguments)
+        raise VdgsError("planned")
+
+    stage = SimpleNamespace(status=lambda: SimpleNamespace(model_id="1-2"))
+    monkeypatch.setattr(render_ortho.OrthoPlan, "of", plan)
+    monkeypatch.setattr(render_ortho, "locate_model", lambda *_: ModelLocation(stage, "coarse", "key", "stands in"))
+    monkeypatch.setattr(RunContext, "capture", house[0])
+    with pytest.raises(VdgsError, match="planned"):
+        render_ortho.render_ortho(
+            RunContext.from_path(tmp_path), OrthoRequest(run=tmp_path), Console(quiet=True),
+            ExecutionOptions(ExecutorOptions(), jobs=2),
+        )  # fmt: skip
+    assert plans[0]["warning"] == "stands in"
 
 
 def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):

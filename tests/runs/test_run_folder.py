@@ -89,8 +89,8 @@ def test_numbers_of_settings_are_decimal():
         ({"capture": {"images": None}}, "`capture` must be a group of settings with a path"),
         ({"merge": {"rule": "mine"}}, r"merge\.rule is 'mine'; it must be owner or max-visibility"),
         ({"blocks": 4}, "there is no setting 'blocks'"),
-        ({"training": {"average": 0.3}}, r"config\.yaml: training has no 'average'.* or start a new --output"),
-        ({"block": {"ring": "ramp"}}, r"config\.yaml: block has no 'ring'; did you mean .* or start a new --output"),
+        ({"training": {"average": 0.3}}, r"config\.yaml: training has no 'average'.* begun anew: vdgs run"),
+        ({"block": {"ring": "ramp"}}, r"config\.yaml: block has no 'ring'; did you mean .* begun anew: vdgs run"),
     ],
 )
 def test_a_setting_that_is_none_is_named(tmp_path, change, complaint):

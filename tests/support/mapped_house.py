@@ -84,12 +84,12 @@ def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = P
     )  # fmt: skip
 
 
-def draw_maps(run: Path, capture: Capture, model: AnchorModel, **asked) -> Path:
+def draw_maps(run: Path, capture: Capture, model: AnchorModel, *, warning: str = "", **asked) -> Path:
     """`vdgs ortho` of a model and a capture that were never trained; returns the folder of the maps."""
     status = SimpleNamespace(model_id="1-2")
     opened = SimpleNamespace(
-        folder=SimpleNamespace(path=run), capture=capture, model=model, name="coarse", status=status
-    )
+        folder=SimpleNamespace(path=run), capture=capture, model=model, name="coarse", status=status, warning=warning
+    )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch, small_figures():
         patch.setattr(RunContext, "open_model", lambda *_, **__: opened)
         request = OrthoRequest(run=run, device="cpu", **asked)

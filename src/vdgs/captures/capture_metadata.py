@@ -46,12 +46,15 @@ def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any]
     """Raise RunError, naming what changed, unless `capture` is the one that `before` (capture_facts) describes."""
     known = (before or {}).get("fingerprint")
     if not isinstance(known, Mapping):
-        raise RunError(f"{source}: does not say which capture the run belongs to. It is damaged; start a new --output.")
+        raise RunError(
+            f"{source}: does not say which capture the run belongs to. It is damaged; begin another run: "
+            "vdgs run CAPTURE --output RUN"
+        )
     changed = [part for part, crc in capture_fingerprint(capture).items() if known.get(part) != crc]
     if changed:
         raise RunError(
             f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "
-            "Restore the capture as it was, or start a new run with another --output."
+            "Restore the capture as it was, or begin another run: vdgs run CAPTURE --output RUN"
         )
 
 

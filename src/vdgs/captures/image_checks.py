@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -43,6 +46,8 @@ def _step(values: np.ndarray, steps: list[float]) -> float:
 
 
 NUM_DECODER_THREADS = 2
+#: Bytes at each end of a file that tell it from others of its length.
+END_BYTES = 4096
 #: Masks that leave out more than this share of the photographs may be inverted.
 MAX_MASKED_FRACTION = 0.6
 
@@ -96,7 +101,8 @@ def check_images(
     if len(blank) == len(checked):
         raise CaptureError(f"{folder}: every photograph is of one color only. Copy the photographs again.")
     masked = 1.0 - sum(view.kept for view in checked) / len(checked)
-    return ImageCheckReport(files, masked, tuple(_warnings(blank, masked)))
+    copies = find_copies([view for view in views if view.name not in set(blank)])
+    return ImageCheckReport(files, masked, tuple(_warnings(blank, masked, copies)))
 
 
 def _check_view(view: View) -> _CheckedView:
@@ -111,8 +117,35 @@ def _check_view(view: View) -> _CheckedView:
     return _CheckedView(view.name, None, not photograph.has_content, kept)
 
 
-def _warnings(blank: list[str], masked: float) -> list[str]:
+def find_copies(views: Sequence[View]) -> list[tuple[str, ...]]:
+    """The names of photographs whose files are the same byte for byte, each with its copies. Whole files are read only
+    where length and both ends agree."""
+    groups = [list(views)]
+    for part in (lambda path: path.stat().st_size, _ends, lambda path: hashlib.sha256(path.read_bytes()).digest()):
+        alike: dict[tuple[int, object], list[View]] = defaultdict(list)
+        for index, group in enumerate(groups):
+            for view in group:
+                alike[index, part(view.image_path)].append(view)
+        groups = [group for group in alike.values() if len(group) > 1]
+    return [tuple(view.name for view in group) for group in groups]
+
+
+def _ends(path: Path) -> bytes:
+    """The first and the last bytes of a file."""
+    with path.open("rb") as file:
+        first = file.read(END_BYTES)
+        file.seek(max(path.stat().st_size - END_BYTES, 0))
+        return first + file.read()
+
+
+def _warnings(blank: list[str], masked: float, copies: list[tuple[str, ...]]) -> list[str]:
     found = []
+    if copies:
+        shown = ", ".join(" = ".join(names[:3]) for names in copies[:3]) + (", ..." if len(copies) > 3 else "")
+        found.append(
+            f"{sum(map(len, copies))} photographs are the same file as another one, under other names ({shown}). Where "
+            "their poses differ, only one of these can be right: remove the copies, or put the right photographs there."
+        )
     if blank:
         shown = ", ".join(blank[:5]) + (", ..." if len(blank) > 5 else "")
         found.append(f"photographs of one color only, which teach nothing but that: {len(blank)} ({shown}).")

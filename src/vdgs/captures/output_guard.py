@@ -61,6 +61,19 @@ def check_output(output: Path) -> None:
         )
 
 
+def check_no_link(output: Path) -> None:
+    """Raise VdgsError where `output` is a link to a file, or to nothing; links to folders are as good as these.
+
+    A file comes to stand in the place of a link, and never in what the link leads to: that may be the store of another
+    program, or of another run.
+    """
+    if output.is_symlink() and not output.is_dir():
+        raise VdgsError(
+            f"{output}: is a link to {os.readlink(output)}, which the output would replace. Nothing was written. Give "
+            "the path that it leads to, or remove the link."
+        )
+
+
 def _check_not_in_capture(output: Path, real: Path) -> None:
     for folder in (real, *real.parents):
         parent = folder.parent

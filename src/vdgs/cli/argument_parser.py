@@ -67,9 +67,10 @@ class GivenArguments:
                 continue
             _check_place(path)
             if not (path / "config.yaml").is_file():
-                from vdgs.captures.output_guard import check_output
+                from vdgs.captures.output_guard import check_no_link, check_output
 
                 check_output(path)
+                check_no_link(path)
 
     def command_line(self, verb: str, without: Iterable[str] = ()) -> str:
         """The command as it can be typed in any folder: with absolute paths, and without some options."""

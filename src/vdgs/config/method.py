@@ -16,6 +16,8 @@ PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"
 #: From which share of the iterations on images are shrunk by which factor.
 ResolutionSchedule = tuple[tuple[Annotated[float, FRACTION], Annotated[int, Range(1, 1024)]], ...]
 
+#: More blocks than any scene is cut into.
+MAX_BLOCKS = 10_000
 LEARNING_RATE_RANGE = Range(0, 100, exclusive_min=True)
 FACTOR_RANGE = Range(0, 1000, exclusive_min=True)
 
@@ -227,7 +229,7 @@ class PartitionConfig:
     strategy: PartitionStrategy = "visibility"
     """How blocks are cut. `visibility`: by position and visibility (the paper). The others are published methods for
     comparison, which also assign cameras in their own way, whatever the settings of the assignment."""
-    blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
+    blocks: Annotated[int | Literal["auto"], Range(1, MAX_BLOCKS)] = 8
     """Number of blocks (K); `auto`: by memory. 1 is the whole scene (the paper's "w/o Blocking"); `auto`
     takes as few as --block-memory-gb allows."""
     lambda_vis: Annotated[float, Range(0, 1000)] = 1.0

@@ -109,6 +109,14 @@ def check_ranges(settings: Any) -> None:
         raise VdgsError(found[0] if len(found) == 1 else "\n  ".join(["These do not work:", *found]))
 
 
+def range_missed(hint: Any, value: Any) -> Range | None:
+    """The range that a number in a value of some type is outside of; None where all are in theirs."""
+    for number, bounds in _ranged(hint, value, None):
+        if number is not None and bounds is not None and not bounds.contains(number):
+            return bounds
+    return None
+
+
 def iter_out_of_range(settings: Any, within: tuple[str, ...] = ()) -> Iterator[NumericSetting]:
     """Every number that is outside its range."""
     for each in iter_numbers(settings, within):

@@ -7,6 +7,7 @@ import difflib
 import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import UnionType
 from typing import Any
@@ -43,16 +44,17 @@ def diff_settings(old: dict[str, Any], new: dict[str, Any], prefix: str = "") ->
     return lines
 
 
-def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") -> Any:
+def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings", *, numeric_text: bool = True) -> Any:
     """The inverse of `to_dict` for a config class: what is not named keeps its default.
 
     Raises ValueError, naming the setting, for one that the class does not have or of another kind. `where` is the group
-    that it all stands in.
+    that it all stands in; `numeric_text` says whether a text may stand for a number, as in files.
     """
     hints = field_hints(kind)
     _check_names(values, hints, where)
     inside = {name: f"{where}.{name}".lstrip(".") for name in values}
-    return kind(**{name: _read_words(hints[name], value, inside[name]) for name, value in values.items()})
+    read = _read_words if numeric_text else partial(read_value, numeric_text=False)
+    return kind(**{name: read(hints[name], value, inside[name]) for name, value in values.items()})
 
 
 def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -> dict[tuple[str, ...], Any]:
@@ -95,38 +97,41 @@ def _read_words(hint: Any, value: Any, where: str) -> Any:
     elif isinstance(value, list):
         value = [plain_number(each, flag, hint) if isinstance(each, str) else each for each in value]
     try:
-        return _read(hint, value, where)
+        return read_value(hint, value, where)
     except ValueError as error:
         how = how_to_write(said, flag, hint) if isinstance(said, str) else ""
         raise ValueError(f"{error}{how}") from None
 
 
-def _read(hint: Any, value: Any, where: str) -> Any:
+def read_value(hint: Any, value: Any, where: str, numeric_text: bool = True) -> Any:
     """A plain value as what its type says. Raises ValueError for one that is of no such type."""
     kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
     origin = typing.get_origin(kind)
+    if getattr(value, "shape", None) == ():  # a number of numpy or torch
+        value = value.item()
+    read = partial(read_value, numeric_text=numeric_text)
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
             raise ValueError(f"{where} is {value!r}, not a group of settings")
-        return from_dict(typing.cast(type, kind), value, where)
+        return from_dict(typing.cast(type, kind), value, where, numeric_text=numeric_text)
     if origin is tuple and isinstance(value, (list, tuple)):
         kinds = [inner[0]] * len(value) if inner[-1:] == (Ellipsis,) else inner
         if len(kinds) == len(value):
-            return tuple(_read(each, item, where) for each, item in zip(kinds, value, strict=True))
+            return tuple(read(each, item, where) for each, item in zip(kinds, value, strict=True))
     if origin in (typing.Union, UnionType):
         for each in inner:
             with suppress(ValueError):
-                return _read(each, value, where)
+                return read(each, value, where)
     if origin is typing.Literal:
         word = ("off", "on")[value] if isinstance(value, bool) else value  # which YAML makes of these words
         if word in inner:
             return word
     if kind is Path and isinstance(value, (str, Path)):
         return Path(value)
-    if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4
+    if kind is float and isinstance(value, str) and numeric_text:  # YAML takes 1e-4 for text: it wants 1.0e-4
         with suppress(ValueError):
             return float(value)
-    if kind is int and isinstance(value, (str, float)):
+    if kind is int and isinstance(value, (str, float) if numeric_text else float):
         with suppress(ValueError):
             return int(value) if isinstance(value, str) else _whole(value)
     plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
 from vdgs.config.method import DensifyConfig, MethodConfig, ResolutionSchedule
-from vdgs.config.ranges import find_range_errors
+from vdgs.config.ranges import find_range_errors, iter_out_of_range, range_missed
+from vdgs.config.serialization import from_dict, read_value
 from vdgs.errors import VdgsError
+
+S = TypeVar("S")
 
 
 def validate_config(config: MethodConfig) -> list[str]:
@@ -23,6 +29,33 @@ def validate_config(config: MethodConfig) -> list[str]:
             "merge.rule max-visibility needs --block.margin ramp or free: a frozen margin has nothing to offer"
         )
     return found
+
+
+def checked_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
+    """Settings that a caller in Python gives, as a dataclass; `where` is what messages call their group.
+
+    Raises VdgsError, in the names of the fields, for an unknown one, a value of another type and a number outside its
+    range.
+    """
+    try:
+        settings: S = from_dict(kind, values, where, numeric_text=False)
+    except ValueError as error:
+        raise VdgsError(str(error)) from error
+    wrong = next(iter_out_of_range(settings, (where,)), None)
+    if wrong is not None:
+        raise VdgsError(f"{'.'.join(wrong.path)} is {wrong.value}; it must be {wrong.range}")
+    return settings
+
+
+def checked_value(name: str, value: Any, hint: Any) -> Any:
+    """An argument of a function of the API, as its type says. Raises VdgsError for another type or number."""
+    try:
+        read = read_value(hint, value, name, numeric_text=False)
+    except ValueError as error:
+        raise VdgsError(str(error)) from error
+    if missed := range_missed(hint, read):
+        raise VdgsError(f"{name} is {read}; it must be {missed}")
+    return read
 
 
 def check_config(config: MethodConfig) -> None:

@@ -18,7 +18,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from vdgs.captures.first_view import default_view
-from vdgs.captures.output_guard import check_not_among_inputs, check_output
+from vdgs.captures.output_guard import check_no_link, check_not_among_inputs, check_output
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
@@ -51,7 +51,7 @@ from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
 from vdgs.system.atomic_files import to_jsonable, write_json
-from vdgs.system.console import make_progress_bar
+from vdgs.system.console import make_progress_bar, print_warning
 from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
 from vdgs.system.scratch import check_takes_files, remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
@@ -160,8 +160,7 @@ def write_files(
     VdgsError, before any Gaussian is baked, for outputs among a capture's inputs, an empty choice, and coordinates
     that a format or the capture does not have; and what `ShardedJob.send` raises.
     """
-    if run.warning:
-        console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    print_warning(console, run.warning)
     for path in request.output:
         check_not_among_inputs(path, run.capture)
     if request.background is not None:
@@ -270,6 +269,7 @@ def _check_names(asked: ExportRequest) -> None:
     for path in paths:
         axes_for(path, asked)
         check_output(path)
+        check_no_link(path)
         registry.check_not_foreign(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(

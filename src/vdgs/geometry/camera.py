@@ -17,6 +17,8 @@ from vdgs.errors import check_kind
 
 CameraModel = Literal["pinhole", "orthographic"]
 
+#: Coordinates are at most so large, in units of the ground frame or the capture's own.
+MAX_COORDINATE = 1e9
 #: Points nearer than this (in units of the ground frame) are never drawn.
 NEAR_PLANE = 0.01
 
@@ -124,6 +126,14 @@ class Camera:
         """Which points are in the frustum, of what `project` says of them."""
         x, y = pixels[:, 0], pixels[:, 1]
         return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+def is_rigid_motion(matrix: np.ndarray) -> bool:
+    """Whether a matrix [4, 4] is a rotation and a translation: finite, without a scale, not mirrored or transposed."""
+    rotation = matrix[:3, :3]
+    finite = bool(np.isfinite(matrix).all()) and np.abs(matrix).max() <= MAX_COORDINATE
+    turned = finite and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    return bool(turned and np.allclose(matrix[3], [0, 0, 0, 1]))
 
 
 def check_cameras(cameras: object) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.thread_count import cpu_count as cpu_count
@@ -56,11 +56,15 @@ def configure_threads(count: int | None = None) -> None:
     `import vdgs` calls it, for the command line and for callers of the API alike: torch's OpenMP threads must block,
     not spin, beside the kernels' own pool, and torch reads OMP_WAIT_POLICY once, when it is imported. So must those of
     OpenBLAS, which numpy starts. A value that is set already stays. `count` 0 means `default_num_threads()`; None
-    leaves the number of threads and imports nothing heavy.
+    leaves the number of threads and imports nothing heavy. Raises VdgsError for what is no number of threads.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # the least: 2^4 cycles
     if count is not None:
+        from vdgs.config.ranges import WORKER_COUNT
+        from vdgs.config.validation_rules import checked_value
+
+        count = checked_value("count", count, Annotated[int, WORKER_COUNT])
         set_num_threads(count or default_num_threads())
 
 

@@ -8,11 +8,11 @@ look along +z (OpenCV). Torch tensors or numpy arrays go in, and the same comes 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -22,10 +22,11 @@ from torch import Tensor
 from vdgs.captures.capture import Capture as Capture
 from vdgs.config.capture_options import CaptureOptions as CaptureOptions
 from vdgs.config.commands import ExportRequest, ModelName, ViewRequest
-from vdgs.config.method import AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
+from vdgs.config.method import MAX_BLOCKS, AssignmentConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.config.presets import PRESETS, PresetName
-from vdgs.config.ranges import check_ranges
-from vdgs.config.serialization import from_dict
+from vdgs.config.ranges import MAX_COUNT, Range
+from vdgs.config.type_hints import field_hints
+from vdgs.config.validation_rules import checked_settings, checked_value
 from vdgs.errors import CaptureError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
 from vdgs.geometry.camera import check_cameras
@@ -152,18 +153,7 @@ def load_capture(path: str | Path, **options: Any) -> Capture:
     """
     from vdgs.captures.loading import load_capture as load
 
-    return load(Path(path), _checked(CaptureOptions, options))
-
-
-def _checked(kind: type, values: Mapping[str, Any]) -> Any:
-    """Options as a dataclass, read as from a file. Raises VdgsError for an unknown name, another type and a number that
-    is outside its range."""
-    try:
-        options = from_dict(kind, values, kind.__name__)
-    except ValueError as error:
-        raise VdgsError(str(error)) from error
-    check_ranges(options)
-    return options
+    return load(Path(path), checked_settings(CaptureOptions, options, "CaptureOptions"))
 
 
 def preset(name: PresetName = "laptop") -> MethodConfig:
@@ -233,6 +223,12 @@ def visibility_ratio(points: Array, cameras: Sequence[Camera]) -> Array:
     return like(points, visibility_counts.visibility_ratio(as_tensor("points", points), cameras))
 
 
+def _checked_config(name: str, config: Any, *kinds: type, remedy: str = "") -> Any:
+    """Settings that a caller made, as `checked_settings` reads them. Raises TypeError for those of another kind."""
+    check_kind(name, config, *kinds, remedy=remedy)
+    return checked_settings(type(config), asdict(config), type(config).__name__)
+
+
 def _check_scene(scene: Any) -> None:
     check_kind("scene", scene, Scene, remedy="vdgs.open_run(RUN).scene and vdgs.train(...) are scenes")
 
@@ -256,13 +252,26 @@ def partition(
     """
     from vdgs.partition.partition_scene import partition_scene
 
-    config = PartitionConfig(blocks=num_blocks, lambda_vis=lambda_vis, balanced=balanced, expansion=expansion)
-    check_ranges(config)
+    hints = field_hints(PartitionConfig)
+    config = PartitionConfig(
+        blocks=checked_value("num_blocks", num_blocks, Annotated[int, Range(1, MAX_BLOCKS)]),
+        lambda_vis=checked_value("lambda_vis", lambda_vis, hints["lambda_vis"]),
+        balanced=checked_value("balanced", balanced, bool),
+        expansion=checked_value("expansion", expansion, hints["expansion"]),
+    )
+    seed = checked_value("seed", seed, field_hints(TrainConfig)["seed"])
     places, counts = (
         as_tensor(name, each).detach().cpu().numpy() for name, each in (("points", points), ("visibility", visibility))
     )
     if places.ndim != 2 or places.shape[1] != 3 or counts.shape != places.shape[:1]:
         raise ValueError(f"points must be [n, 3] and visibility [n], not {places.shape} and {counts.shape}")
+    if not len(places):
+        raise VdgsError("points is empty: there is nothing to cut into blocks")
+    if not np.isfinite(places).all():
+        wrong = int((~np.isfinite(places)).any(axis=1).sum())
+        raise VdgsError(f"points must be finite, and {wrong} of {len(places)} are not: leave them out")
+    if not (np.isfinite(counts) & (counts >= 0) & (counts <= MAX_COUNT) & (counts == np.floor(counts))).all():
+        raise VdgsError("visibility must be whole numbers of cameras, at least 0: vdgs.count_visibility gives them")
     blocks, notes = partition_scene(places, counts.astype(np.int64), config, seed)
     _warn(notes)
     return blocks
@@ -282,8 +291,7 @@ def assign_cameras(
 
     _check_scene(scene)
     check_cameras(cameras)
-    config = config or AssignmentConfig()
-    check_ranges(config)
+    config = _checked_config("config", AssignmentConfig() if config is None else config, AssignmentConfig)
     decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
     _warn(decided.warnings)
     return decided
@@ -304,7 +312,7 @@ def merge(
     """
     from vdgs.partition.merging import merge_blocks
 
-    settings, cameras = _checked(MergeConfig, {"rule": rule}), scene.cameras
+    settings, cameras = checked_settings(MergeConfig, {"rule": rule}, "merge"), scene.cameras
     if assignment.cameras.shape != (len(cameras), len(blocks)):
         raise ValueError(
             f"the assignment is {list(assignment.cameras.shape)}, not [{len(cameras)} training cameras, "
@@ -329,7 +337,7 @@ def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
     if scene.capture is None:
         raise VdgsError(f"{path}: baking needs the training cameras: give the capture, as in Scene(model, capture)")
     paths = {"run": Path(path).parent, "output": (Path(path),), "evaluate": False}
-    request = resolve_request(_checked(ExportRequest, options | paths))
+    request = resolve_request(checked_settings(ExportRequest, options | paths, "export"))
     opened = runs.OpenedRun(
         folder=RunFolder(request.run), model=scene.model, model_path=Path(path), capture=scene.capture, key="",
         name="merged" if scene.model.decoder_spans else "coarse", status=StatusRecord(state="done"), warning="",
@@ -358,19 +366,25 @@ def train(
     """
     from vdgs.pipeline.train_in_memory import train_in_memory, train_in_run_folder
 
-    config = preset(config) if isinstance(config, str) else config
-    device, options = select_device(device).device, vars(capture_options or CaptureOptions())
+    named = preset(config) if isinstance(config, str) else config
+    method = _checked_config("config", named, MethodConfig, TrainConfig, remedy="presets are named by a text")
+    check_kind("callbacks", callbacks, Iterable, remedy="give a list of functions")
+    callbacks = tuple(callbacks)
+    for callback in callbacks:
+        check_kind("each of callbacks", callback, Callable)  # type: ignore[arg-type]
+    options = CaptureOptions() if capture_options is None else capture_options
+    settings = _checked_config("capture_options", options, CaptureOptions)
+    device = select_device(device).device
     if run_dir is None:
-        if isinstance(config, MethodConfig) and config.block.mask_moving == "on":
+        if isinstance(method, MethodConfig) and method.block.mask_moving == "on":
             raise VdgsError("mask_moving='on' keeps the masks that it makes in a run folder: name one (run_dir)")
-        opened = capture if isinstance(capture, Capture) else load_capture(capture, **options)
-        return Scene(train_in_memory(opened, config, tuple(callbacks), _warning_console(), device), opened)
+        opened = capture if isinstance(capture, Capture) else load_capture(capture, **vars(settings))
+        return Scene(train_in_memory(opened, method, callbacks, _warning_console(), device), opened)
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
         raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
-    settings = _checked(CaptureOptions, options)
-    train_in_run_folder(Path(capture), settings, config, Path(run_dir), _warning_console(), device)
-    return open_run(run_dir, model="coarse" if isinstance(config, TrainConfig) else "best", device=device).scene
+    train_in_run_folder(Path(capture), settings, method, Path(run_dir), _warning_console(), device)
+    return open_run(run_dir, model="coarse" if isinstance(method, TrainConfig) else "best", device=device).scene
 
 
 def view(run: Run | str | Path, *, host: str = "127.0.0.1", port: int | None = None) -> None:

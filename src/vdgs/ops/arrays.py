@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vdgs.errors import check_kind
-from vdgs.geometry.camera import Camera, CameraModel
+from vdgs.config.ranges import MAX_COUNT, Range
+from vdgs.config.validation_rules import checked_value
+from vdgs.errors import VdgsError, check_kind
+from vdgs.geometry.camera import Camera, CameraModel, is_rigid_motion
 
+#: What is no skew but rounding, in pixels.
+MAX_SKEW_PX = 1e-6
 #: Tensors or arrays: what goes in comes out.
 Array = TypeVar("Array", Tensor, np.ndarray)
 
@@ -52,12 +56,26 @@ def cameras_from(
 ) -> list[Camera]:
     """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3] in pixels.
 
-    Raises ValueError for other shapes.
+    Raises VdgsError for what makes no camera: a pose that is no rotation and translation, intrinsics with skew or of
+    another scale, a size that is no whole number. ValueError for other shapes.
     """
+    width, height = (
+        checked_value(name, side, Annotated[int, Range(1, MAX_COUNT)])
+        for name, side in (("width", width), ("height", height))
+    )
+    model = checked_value("model", model, CameraModel)
     given = (each.detach().cpu().numpy() if isinstance(each, Tensor) else each for each in (viewmats, Ks))
     poses, intrinsics = (np.array(each, np.float64) for each in given)
     if poses.shape != (len(poses), 4, 4) or intrinsics.shape not in ((3, 3), (len(poses), 3, 3)):
         raise ValueError(f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}")
+    for index, pose in enumerate(poses):
+        if not is_rigid_motion(pose):
+            raise VdgsError(
+                f"viewmats[{index}] is no rotation and translation of finite numbers: {pose.tolist()}. It leads from "
+                "the world into the camera, and its last row is 0 0 0 1. Divide the rotation by its scale, undo a "
+                "mirroring, or transpose the matrix."
+            )
+    _check_intrinsics(intrinsics)
     return [
         Camera(
             camera_from_world=pose, fx=K[0, 0].item(), fy=K[1, 1].item(), cx=K[0, 2].item(), cy=K[1, 2].item(),
@@ -65,3 +83,15 @@ def cameras_from(
         )
         for pose, K in zip(poses, np.broadcast_to(intrinsics, (len(poses), 3, 3)), strict=True)
     ]  # fmt: skip
+
+
+def _check_intrinsics(Ks: np.ndarray) -> None:
+    """Raise VdgsError unless all of them [..., 3, 3] are those of a camera without skew."""
+    for K in Ks.reshape(-1, 3, 3):
+        plain = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+        if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0 and np.abs(K - plain).max() <= MAX_SKEW_PX):
+            raise VdgsError(
+                f"Ks holds {K.tolist()}, not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0. Transpose a "
+                "transposed one and divide one of another scale by its last number; cameras here have no skew: bring "
+                "such images to one without."
+            )

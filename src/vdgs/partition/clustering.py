@@ -77,7 +77,7 @@ def check_distinct(count: int, rows: Float[np.ndarray, "n d"]) -> None:
     distinct = len(np.unique(rows, axis=0))
     if distinct < count:
         raise VdgsError(
-            f"--blocks {count}: the scene has only {distinct} distinct anchors to cut into blocks. "
+            f"{count} blocks: the scene has only {distinct} distinct anchors to cut into blocks. "
             f"Ask for at most {distinct}, or for 1."
         )
 

@@ -42,7 +42,7 @@ from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.stage_folder import StatusRecord
-from vdgs.system.console import track
+from vdgs.system.console import print_warning, track
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
@@ -59,6 +59,7 @@ def build_lod(context: RunContext, request: LodRequest, console: Console) -> Pat
     Raises RunError if the model is not trained, and VdgsError, before any work, where the disk has no room.
     """
     run, location = context.run, locate_model(context.run, request.model)
+    print_warning(console, location.warning)
     folder, model_id = lod_folder(run), location.stage.status().model_id or ""
     with folder.locked():
         if folder.key() == _key(model_id) and (folder.path / TREE_FILE).exists():

@@ -52,6 +52,7 @@ from vdgs.runs.open_run import ModelLocation, OpenedRun, load_run_blocks, locate
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json, write_bytes, write_json
+from vdgs.system.console import print_warning
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.memory_estimate import render_bytes
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
@@ -161,8 +162,7 @@ def evaluate_stage(
         evaluate_stage(context, replace(request, views="off-path"), console, execution)
     evaluation = _Evaluation.create(request)
     run, model = evaluation.run, evaluation.model
-    if model.warning:
-        console.print(f"[yellow]warning[/] {model.warning}", highlight=False)
+    print_warning(console, model.warning)
     start = time.monotonic()
     if execution is not None and execution.is_distributed:
         peak = _evaluate_in_shards(context, evaluation, execution, console)

@@ -24,7 +24,8 @@ from vdgs.system.tensors import file_id
 def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: Console) -> None:
     """Merge the blocks of a run into RUN/merged; nothing if they are merged already.
 
-    Raises RunError if a block is missing or failed, unless `allow_missing_blocks`: the coarse anchors then stand in.
+    Raises RunError if a block is missing or failed, even where an earlier merge did without it, unless
+    `allow_missing_blocks`: the coarse anchors then stand in.
     """
     run = context.run
     with run.locked():
@@ -32,11 +33,11 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         folders = [run.block(index) for index in range(len(blocks))]
         done = [folder.needs_no_work(keys.blocks) for folder in folders]
         models = [folder.status().model_id if is_done else None for folder, is_done in zip(folders, done, strict=True)]
+        if not all(done) and not allow_missing_blocks:
+            raise RunError(_missing_blocks_text(run, done))
         if run.merged.needs_no_work(keys.merge) and run.merged.status().block_models == tuple(models):
             console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
             return
-        if not all(done) and not allow_missing_blocks:
-            raise RunError(_missing_blocks_text(run, done))
         reset_peak_memory()
         start = time.monotonic()
         opened = context.open_model("coarse")

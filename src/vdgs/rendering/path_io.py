@@ -37,7 +37,7 @@ from vdgs.config import commands
 from vdgs.config.ranges import Range
 from vdgs.config.serialization import suggest
 from vdgs.errors import VdgsError
-from vdgs.geometry.camera import Camera
+from vdgs.geometry.camera import MAX_COORDINATE, Camera, is_rigid_motion
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.rendering.camera_paths import (
     DEFAULT_FPS,
@@ -68,8 +68,6 @@ _SAME_ASPECT = 0.02
 _FOCAL, _PIXELS = Range(0, 1e7, exclusive_min=True), Range(-1e7, 1e7)
 _SIDE = Range(1, commands.MAX_RENDER_SIDE_PX)
 _FOV_DEG = Range(0, 180, exclusive_min=True, exclusive_max=True)
-#: Coordinates, in units of the ground frame or the capture's own.
-_MAX_COORDINATE = 1e9
 
 
 def load_path(
@@ -271,11 +269,7 @@ def _matrix(value: Any, name: str) -> Float[np.ndarray, "4 4"]:
         matrix = np.concatenate([matrix.reshape(3, 4), [[0.0, 0.0, 0.0, 1.0]]])
     _require(matrix.size == 16, f"{name} must be 4 x 4 numbers")
     matrix = matrix.reshape(4, 4)
-    rotation = matrix[:3, :3]
-    finite = np.isfinite(matrix).all() and np.abs(matrix).max() <= _MAX_COORDINATE
-    rigid = finite and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-    last_row = np.allclose(matrix[3], [0, 0, 0, 1])
-    _require(bool(rigid and last_row), f"{name} must be a rotation and a translation")
+    _require(is_rigid_motion(matrix), f"{name} must be a rotation and a translation")
     return matrix
 
 
@@ -284,7 +278,7 @@ def _vector(value: Any, name: str) -> Float[np.ndarray, "3"]:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         vector = np.zeros(0)
-    whole = vector.shape == (3,) and bool(np.isfinite(vector).all()) and np.abs(vector).max() <= _MAX_COORDINATE
+    whole = vector.shape == (3,) and bool(np.isfinite(vector).all()) and np.abs(vector).max() <= MAX_COORDINATE
     _require(bool(whole), f"{name} must be three numbers")
     return vector
 

@@ -33,7 +33,7 @@ from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_c
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import get_run_visibility, require_some_seen, with_fade
 from vdgs.system.atomic_files import write_array
-from vdgs.system.console import track
+from vdgs.system.console import print_warning, track
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
@@ -113,8 +113,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
     scene = _with_fade(request, run, scene, run_cameras.cameras)
     run = replace(run, model=scene) if isinstance(scene, AnchorModel) else run
-    if run.warning:
-        console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    print_warning(console, run.warning)
     if request.seconds and request.path is None and request.views in ("test", "train"):
         console.print(f"[yellow]note[/] --seconds is of camera paths; --views {request.views} draws one frame a view")
     named, fps = _named_cameras(request, run_cameras)

@@ -119,15 +119,16 @@ def _parse_settings(path: Path, text: str) -> RunSettings:
     missing = [name for name in SECTIONS if not isinstance(settings, dict) or name not in settings]
     if missing:  # a part of a file may be YAML too: defaults in place of the rest would train another scene
         raise RunError(
-            f"{path}: is damaged or not of a vdgs run (no `{missing[0]}`). Put a whole copy there, or start a new "
-            "--output."
+            f"{path}: is damaged or not of a vdgs run (no `{missing[0]}`). Put a whole copy there, or begin "
+            "another run: vdgs run CAPTURE --output RUN"
         )
     settings.pop("vdgs", None)
     try:
         return RunSettings.from_dict(settings)
     except (ValueError, TypeError) as error:
         raise RunError(
-            f"{path}: {error}. Correct the file, or start a new --output: a run of another version cannot be continued."
+            f"{path}: {error}. Correct the file; a run of another version cannot be continued, but begun anew: "
+            "vdgs run CAPTURE --output RUN"
         ) from error
 
 

@@ -92,7 +92,7 @@ def check_has_anchors(folder: RunFolder, anchors: int | None) -> None:
         raise RunError(
             f"{folder.coarse.path}: the coarse model holds no anchors: in training all of them were taken for "
             f"transparent and removed. Give a smaller --densify.prune-opacity (it is {growth.prune_opacity:g}) or a "
-            "larger --densify.start, to `vdgs run` with --overwrite or in a new --output, and look at the photographs "
+            "larger --densify.start, to `vdgs run --overwrite` or in another run, and look at the photographs "
             "with `vdgs inspect`: do they show the place, through the right cameras?"
         )
 
@@ -166,7 +166,8 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
     path = at or Path(settings.capture_path)
     if at is None and not path.exists():
         raise CaptureError(
-            f"{path}: the capture of {folder.path} is not there. If it was moved, give its folder: --capture PATH."
+            f"{path}: the capture of {folder.path} is not there. If it was moved, say where to, once: "
+            f"vdgs visibility {shell_word(folder.path)} --capture PATH"
         )
     return load_capture(path, settings.capture)
 

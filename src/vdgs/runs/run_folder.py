@@ -115,7 +115,7 @@ class RunFolder:
                 raise RunError(
                     f"{self.config_file}: this run was started with other settings:\n  "
                     + "\n  ".join(changed)
-                    + "\nGive the old settings to continue it, or another --output to start a new run."
+                    + "\nGive the old settings to continue it, or begin another run: vdgs run CAPTURE --output RUN"
                 )
             return
         self.check_output_empty()
@@ -127,12 +127,12 @@ class RunFolder:
             return
         known = {".lock", self._driver.name, *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
         if self.path.exists() and not self.path.is_dir():
-            raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
+            raise RunError(f"{self.path}: is a file. Choose a folder for the run.")
         files = self.path.iterdir() if self.path.exists() else ()
         if unknown := sorted(file.name for file in files if file.name not in known and file.suffix != ".tmp"):
             raise RunError(
                 f"{self.path}: holds other files ({', '.join(unknown[:3])}) and no config.yaml. "
-                "Choose an empty or a new folder for --output."
+                "Choose an empty or a new folder for the run."
             )
 
     def change_settings(self, settings: RunSettings, overwrite: bool, command: str | None = None) -> list[str]:
@@ -157,7 +157,7 @@ class RunFolder:
                 f"{self.config_file}: other settings than this run has:\n  "
                 + "\n  ".join(changed)
                 + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old "
-                "settings to continue, or take another --output."
+                "settings to continue, or begin another run: vdgs run CAPTURE --output RUN"
             )
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings

@@ -106,6 +106,12 @@ def escape_names(text: str) -> str:
     return _NOT_OURS.sub(r"\\\g<0>", text)
 
 
+def print_warning(console: Console, warning: str) -> None:
+    """Print a warning; nothing where it is empty."""
+    if warning:
+        console.print(f"[yellow]warning[/] {warning}", highlight=False)
+
+
 def print_once(console: Console, text: str, style: str) -> None:
     """Print a line, unless this console has it already."""
     printed = _PRINTED.setdefault(console, set())

@@ -28,6 +28,7 @@ from vdgs.kernels.idle_memory import trim_heap
 from vdgs.runs.lod_status import is_of_present_version
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
+from vdgs.system.console import print_warning
 from vdgs.system.memory.process_memory import limit_malloc_arenas
 from vdgs.system.quoting import shell_word
 from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
@@ -55,8 +56,7 @@ def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], N
     limit_malloc_arenas()
     find_free_port(request.host, request.port)  # said before the run is opened
     run = open_run_or_checkpoint(request.run, request.model, request.device)
-    if run.warning:
-        console.print(f"[yellow]warning[/] {run.warning}", highlight=False)
+    print_warning(console, run.warning)
     if not is_of_present_version(run.folder):
         console.print(
             f"[yellow]warning[/] the level-of-detail tree is of another version of vdgs, so that all of the model is "

@@ -61,8 +61,13 @@ class OrthoPlan:
     lod_error: float | None
     """How many pixels places may be off, drawn through the level-of-detail tree; None: drawn from all anchors."""
 
+    warning: str = ""
+    """Why it is not the model that one would expect (`runs.open_run`); empty where it is."""
+
     @staticmethod
-    def of(request: OrthoRequest, run: Path, model: str, model_digest: str | None, capture: Capture) -> OrthoPlan:
+    def of(
+        request: OrthoRequest, run: Path, model: str, model_digest: str | None, capture: Capture, warning: str = ""
+    ) -> OrthoPlan:  # fmt: skip
         """The map that is asked for of a run folder. Raises VdgsError for a system, pixel size or extent that makes
         none, and for an output among inputs of the capture."""
         folder = output_folder(request, run)
@@ -80,7 +85,7 @@ class OrthoPlan:
         return OrthoPlan(
             folder=folder, run_name=run.name, model=model, model_digest=model_digest, nadir_camera=above, grid=grid,
             samples=samples_per_side(grid.gsd, finest), detail_from_images=request.detail_from_images,
-            lod_error=request.lod_error,
+            lod_error=request.lod_error, warning=warning,
         )  # fmt: skip
 
     @property

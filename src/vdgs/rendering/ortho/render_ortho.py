@@ -29,7 +29,7 @@ from vdgs.runs.open_run import locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import to_jsonable, write_json
-from vdgs.system.console import track
+from vdgs.system.console import print_warning, track
 from vdgs.system.documents import MapMetadata
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
@@ -64,7 +64,7 @@ def _render_locally(context: RunContext, request: OrthoRequest, console: Console
     """Draw in this process; returns the share of the pixels that are mapped, and the folder."""
     run = context.open_model(request.model, request.device, mapped=request.lod_error is not None)
     scene = drawn_scene(run, request.lod_error, request.device)
-    plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model_id, run.capture)
+    plan = OrthoPlan.of(request, run.folder.path, run.name, run.status.model_id, run.capture, run.warning)
     _print_plan(plan, console)
     clear(plan.folder)
     with plan.tile_renderer(scene) as renderer:
@@ -79,7 +79,8 @@ def _render_sharded(
     context.release_models()
     run = RunFolder(Path(os.path.abspath(request.run)))  # as in `stages.train`: other machines may mount it so
     model = locate_model(run, request.model)
-    plan = OrthoPlan.of(request, run.path, model.name, model.stage.status().model_id, context.capture)
+    model_id = model.stage.status().model_id
+    plan = OrthoPlan.of(request, run.path, model.name, model_id, context.capture, model.warning)
     _print_plan(plan, console, sharded=True)
     with distributed_tiles(plan, request, run, model, execution, console) as tiles:
         return _write(plan, _counted(run, plan, tiles), console), plan.folder
@@ -150,6 +151,7 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
 def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> None:
     """Print how large the map will be; raise VdgsError where the disk has no room for it."""
     grid, placement, folder = plan.grid, plan.placement, plan.folder
+    print_warning(console, plan.warning)
     for note in placement.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
     share = _DISK_SHARE + sharded  # tiles of shards lie beside it until all are gathered
@@ -216,5 +218,6 @@ def _metadata(plan: OrthoPlan) -> MapMetadata:
         "heights": placement.height_reference, "georeference": capture.ground.description,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
         "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
-        "training_cameras": len(capture.train_views), "notes": list(placement.notes), "lod_error": plan.lod_error,
+        "training_cameras": len(capture.train_views),
+        "notes": [*filter(None, [plan.warning]), *placement.notes], "lod_error": plan.lod_error,
     }  # fmt: skip

@@ -75,7 +75,7 @@ def resume_or_start(
 
     Raises RunError for a state that this version cannot read or that is beyond the last iteration.
     """
-    advice, restore = "Start a new --output.", lambda saved: from_checkpoint(saved, stage)
+    advice, restore = "Begin another run: vdgs run CAPTURE --output RUN", lambda saved: from_checkpoint(saved, stage)
     return restore_or_start(folder, stage.config.iterations, start, restore, advice, console)
 
 
