@@ -76,9 +76,12 @@ def sizes(workspace: Workspace) -> list[int]:
     return [model.num_reg_images() for model in incremental_mapper.read_models(workspace)]
 
 
-def join(workspace: Workspace) -> None:
+def join(workspace: Workspace) -> str:
+    """What is said of it."""
+    said = Console(record=True, width=200, file=io.StringIO())
     incremental_mapper.set_models_aside(workspace)
-    global_mapper.place_left_out(workspace, 16, True, 1, CONSOLE)
+    global_mapper.place_left_out(workspace, 16, True, 1, said)
+    return said.export_text()
 
 
 def test_parts_that_few_points_join_become_one_model(tmp_path):
@@ -87,7 +90,7 @@ def test_parts_that_few_points_join_become_one_model(tmp_path):
     assert len(count_verified_matches(workspace)) == 16
     assert sizes(workspace) == [8, 8]
     assert global_mapper.leaves_photographs_out(workspace)
-    join(workspace)
+    assert "end in parts of 8, 8; all at once 16 are placed" in join(workspace)
     assert sizes(workspace) == [16]
     assert not global_mapper.leaves_photographs_out(workspace)
     model = incremental_mapper.read_models(workspace)[0]
@@ -129,12 +132,10 @@ def test_parts_stay_where_all_at_once_is_no_better(copied, monkeypatch, why):
         monkeypatch.setattr(global_mapper.sys, "executable", "false")
     else:
         monkeypatch.setattr(global_mapper, "MAX_MOVED_SHARE", 0.0)
-    said = Console(record=True, width=200, file=io.StringIO())
-    incremental_mapper.set_models_aside(copied)
-    global_mapper.place_left_out(copied, 16, True, 1, said)
+    said = join(copied)
     assert sizes(copied) == [8, 8]
-    assert f"all photographs at once: the {'mapper ended without a model' if why == 'no model' else 'part of 8'}" in (
-        said.export_text()
+    assert (
+        f"all photographs at once: the {'mapper ended without a model' if why == 'no model' else 'part of 8'}" in said
     )
     assert not list(copied.path.glob("global-*"))
 

@@ -72,9 +72,13 @@ def place_left_out(workspace: Workspace, count: int, fix_focal: bool, threads: i
     except CaptureError as error:  # of COLMAP
         why = str(error)
     if why:
-        said = f"all photographs at once: {escape(why)}; the parts stay as they are"
-        console.print(f"[yellow]note[/] {said}", highlight=False)
         incremental_mapper.take_models_back(workspace)
+        said = f"all photographs at once: {escape(why)}; the parts stay as they are"
+    else:
+        placed = len(placed_images(incremental_mapper.read_models(workspace)[0]))
+        sizes = ", ".join(str(len(placed_images(part))) for part in parts)
+        said = f"placed one by one the photographs end in parts of {sizes}; all at once {placed} are placed"
+    console.print(f"[yellow]note[/] {said}", highlight=False)
 
 
 def _take(workspace: Workspace, parts: Sequence[pycolmap.Reconstruction]) -> str:
