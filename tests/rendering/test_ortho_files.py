@@ -127,10 +127,10 @@ def test_what_a_killed_command_left_goes_before_the_work_and_is_said(house, make
 
 
 def test_a_model_that_stands_in_for_the_merged_one_is_said_and_noted(house, make, capsys):
-    stands_in = "this is the coarse model, not the merged one: there is none yet."
+    stands_in = "this is the coarse model, not the merged one: there is none yet. Next: vdgs merge /home/me/run"
     folder = make(*house, gsd=0.5, warning=stands_in)
     assert f"warning {stands_in}" in " ".join(capsys.readouterr().err.split())
-    assert stands_in in json.loads((folder / "map.json").read_text())["notes"]
+    assert json.loads((folder / "map.json").read_text())["notes"] == ["this is the coarse model, not the merged one"]
     folder = make(*house, gsd=0.5)
     assert "warning" not in capsys.readouterr().err
     assert "coarse model" not in str(json.loads((folder / "map.json").read_text())["notes"])

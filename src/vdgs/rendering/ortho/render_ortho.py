@@ -219,5 +219,6 @@ def _metadata(plan: OrthoPlan) -> MapMetadata:
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
         "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
         "training_cameras": len(capture.train_views),
-        "notes": [*filter(None, [plan.warning]), *placement.notes], "lod_error": plan.lod_error,
+        # Of the warning what is wrong, without the command, which has the path of the run.
+        "notes": [*filter(None, [plan.warning.partition(":")[0]]), *placement.notes], "lod_error": plan.lod_error,
     }  # fmt: skip
