@@ -88,4 +88,5 @@ def test_analyses_that_are_here_can_be_imported(analysis):
     for package in ("rasterio", "pycolmap"):
         if f"import {package}" in analysis.read_text(encoding="utf-8"):
             pytest.importorskip(package)
-    import_module(f"experiments.reports.analyses.{analysis.stem}")
+    module = import_module(f"experiments.reports.analyses.{analysis.stem}")
+    assert re.search(rf"python .*analyses[./]{analysis.stem}\b", module.__doc__), "says no command"
