@@ -211,6 +211,18 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     assert "in the exposure of its neighbors" in text
 
 
+def test_neutral_colors_may_be_of_another_picture_than_exposures_depart_from(city: City, tmp_path: Path):
+    darker = {id(v.camera): as_render(drawn * 0.5) for v, drawn in zip(city.views, city.renders, strict=True)}
+    model = RenderableModel(render=city.render, exposure=lambda view: torch.eye(3, 4))
+    evaluate_model(city.taken, model, tmp_path / "same")
+    evaluate_model(
+        city.taken, replace(model, render_neutral=lambda camera: darker[id(camera)]), tmp_path / "other"
+    )  # fmt: skip
+    same, other = (read(tmp_path / folder / "metrics.json") for folder in ("same", "other"))
+    assert (other["psnr"], other["ssim"]) == (same["psnr"], same["ssim"])
+    assert other["psnr_reference_exposure"] < same["psnr_reference_exposure"] - 1
+
+
 def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
     model = RenderableModel(render=city.render)
     with pytest.raises(RunError, match="no test views"):

@@ -33,8 +33,9 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=3)
     asked = parser.parse_args()
     run = open_run(asked.run)
-    trained = draw(run.model, run.capture.train_views[:: asked.every])
-    held_out = draw(run.model, run.capture.test_views)
+    model = run.model.without_local_exposure()
+    trained = draw(model, run.capture.train_views[:: asked.every])
+    held_out = draw(model, run.capture.test_views)
     colors, photographs = (np.concatenate(column) for column in zip(*trained, strict=True))
     best = np.linalg.lstsq(colors, photographs, rcond=None)[0]
     print(describe())

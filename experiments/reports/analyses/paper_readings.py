@@ -39,6 +39,7 @@ Changes = dict[str, Any]
 SCENES = {
     "seneca": (("--images", "images_4", "--downscale", "2"), 8),
     "copr": (("--images", "images_4"), 4),
+    "horizon": ((), 4),  # of `vdgs synth DATA/horizon --flight horizon --size village --truth`: photographs show sky
 }
 #: 1 500 steps instead of 100 000, 200 for each block instead of 50 000; growth begins and is decided sooner.
 COARSE = (
@@ -78,6 +79,7 @@ COARSE_READINGS: dict[str, tuple[str, ...]] = {
     "coarse: sparse Adam": ("--optimizer", "sparse-adam"),
     "coarse: blur of a photograph's pixel": ("--model.photograph-blur",),
     "coarse: compensation": ("--compensation.enabled",),
+    "coarse: environment map behind the scene": ("--model.background-model", "envmap"),
 }
 #: Readings of both stages: options of `vdgs train-coarse`, and what follows the coarse model.
 TO_THE_END: dict[str, tuple[tuple[str, ...], Changes]] = {
@@ -102,7 +104,7 @@ READINGS: dict[str, Changes] = {
     "g to sums, one gate": {"block.compensation.target": "sum", "block.compensation.min_draws": "paper"},
     "T_low = 0.05": {"block.compensation.t_low": 0.05},
     "T_low = 0.3": {"block.compensation.t_low": 0.3},
-    "β_g = 0.1": {"block.compensation.beta_g": 0.1},
+    **{f"β_g = {beta:g}": {"block.compensation.beta_g": beta} for beta in (0.1, 1, 4)},
     "γ = 0.5": {"block.compensation.gamma": 0.5},
     "rates of blocks times 0.4 and 0.8": {"block.lr_scale_offsets": 0.4, "block.lr_scale_log_scales": 0.8},
     "random color behind blocks": {"block.random_background": 1.0},
@@ -302,7 +304,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", default=["seneca", "copr"], choices=list(SCENES))
     parser.add_argument("--only", nargs="+", default=[])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--counts", action="store_true", help="cuts and cameras alone, without training blocks")

@@ -211,10 +211,9 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
     exposure_compensation: bool = False
-    """Fit an affine color model to each photograph. The scene is drawn in neutral colors, which in one exposure for all
-    come nearest to the photographs, and compared with a test photograph in the exposure predicted from the training
-    photographs taken before and after it and from its metadata (no pixel of it is used). Blocks keep the models
-    (choice)."""
+    """Fit an affine color model to each photograph. The scene is drawn in neutral colors (--merge.reference-exposure),
+    and compared with a test photograph in the exposure predicted from the training photographs taken before and after
+    it and from its metadata (no pixel of it is used). Blocks keep the models (choice)."""
     exposure_min_spread: Annotated[float, Range(0, 1)] = 0.0
     """Fit exposures only where photographs of the same sparse points differ in brightness by at least this share
     (choice: with one exposure, fitting gains nothing). At 0, and in a capture without tracks, always fitted."""
@@ -336,6 +335,10 @@ class MergeConfig:
     rule: Literal["owner", "max-visibility"] = "owner"
     """Whose anchors stay at a position: `owner`: those of the block with the nearest core. `max-visibility`: those of
     the block whose cameras see it most, among those that reach it (needs --block.margin ramp or free)."""
+    reference_exposure: Literal["local", "global"] = "local"
+    """In which exposure a scene is drawn, exported and mapped, where exposures were fitted: `local`: that which
+    photographs of a place have in the mean, smoothly; `global`: one for all. `vdgs merge RUN --reference-exposure`
+    changes it in seconds."""
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,11 @@ def make_renderable_model(
 ) -> RenderableModel:
     """The opened model as the evaluation sees it, beside the coarse model of its run."""
     scene = drawn_scene(run, lod_error, str(coarse.device))
+    exposures, plain = None, scene
+    if views != "off-path" and (lod_error is None or run.model.local_exposure is None):  # a tree has the local one
+        exposures = make_exposures(run.model, run.capture)
+        if exposures is not None and isinstance(scene, AnchorModel):
+            plain = scene.without_local_exposure()
     metadata = EvaluatedModel(
         model=run.name,
         n_anchors=len(run.model.anchors),
@@ -109,14 +114,14 @@ def make_renderable_model(
         key=run.key,
     )
     measured = RenderableModel(
-        render=lambda camera: render(scene, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
+        render=lambda camera: render(plain, camera), visibility_map=make_visibility_map(coarse), metadata=metadata,
         background=run.model.background, background_image=lambda camera: background_image(scene, camera),
         coverage_map=make_coverage_map(coarse),
         true_depth=make_true_depth(run.capture, select_views(run.capture, views)),
         render_depth=lambda camera: render(scene, camera, depth=True), camera_height=camera_height(run.capture),
         decode_splats=lambda camera: view_splats(scene, camera)[1],
         training_cameras=[view.camera for view in run.capture.train_views],
-        exposure=None if views == "off-path" else make_exposures(run.model, run.capture),
+        exposure=exposures, render_neutral=None if plain is scene else lambda camera: render(scene, camera),
     )  # fmt: skip
     return with_off_path_truth(measured, run.capture) if views == "off-path" else measured
 
@@ -186,12 +191,13 @@ def make_true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View],
 
 def make_block_inputs(opened: OpenedRun, coarse: OpenedRun, images: ReferenceViews) -> BlockInputs:
     """Where the pictures of a run's blocks come from; the merged model is the one that was opened."""
-    run = opened.folder
+    run, merged = opened.folder, opened.model.without_local_exposure()
+    before = coarse.model.without_local_exposure()
     return BlockInputs(
         reference_views=images,
-        render_coarse=lambda camera: render(coarse.model, camera, depth=True),
-        render_merged=lambda camera: render(opened.model, camera, depth=True),
-        render_block=IsolatedBlocks(run, coarse.model).render,
+        render_coarse=lambda camera: render(before, camera, depth=True),
+        render_merged=lambda camera: render(merged, camera, depth=True),
+        render_block=IsolatedBlocks(run, before).render,
         blocks=load_run_blocks(run),
         exposure=make_exposures(opened.model, opened.capture),
     )  # fmt: skip

@@ -66,6 +66,8 @@ class RenderableModel:
     training_cameras: Sequence[Camera] = ()
     #: The color model of a view (`model.exposure`), in which its picture is measured; None: neutral colors.
     exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
+    #: The picture in neutral colors, where it is not that which exposures are applied to.
+    render_neutral: Callable[[Camera], RenderedView] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for a true depth without what it is compared with."""

@@ -50,7 +50,8 @@ def make_exposures(
     model: AnchorModel, capture: Capture, draw: Callable[[Camera], Raster] | None = None
 ) -> ViewExposures | None:
     """The color model (`model.exposure`) of any view of the capture that a model was trained on. None where training
-    fitted none. `draw` makes the small pictures that are metered, where not the whole model shall."""
+    fitted none. They are of pictures without `AnchorModel.local_exposure`. `draw` makes the small pictures that are
+    metered, where not the whole model shall."""
     return None if model.decoder.exposure is None else ViewExposures(model, capture, draw)
 
 
@@ -59,7 +60,7 @@ class ViewExposures:
     flight, and corrected for what the camera metered there."""
 
     def __init__(self, model: AnchorModel, capture: Capture, draw: Callable[[Camera], Raster] | None = None):
-        self._render = draw or (lambda camera: render(model, camera))
+        self._render = draw or (lambda camera: render(model.without_local_exposure(), camera))
         exposure = model.decoder.exposure
         assert exposure is not None, "training fitted no exposures"
         self._departures = exposure.detach().to("cpu", torch.float64)

@@ -7,7 +7,7 @@ gathered in the order of the views, and have the same bits.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -30,8 +30,9 @@ from vdgs.evaluation.depth_errors import (
 )
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.opacity_coverage import RenderedImage, count_oversized_splats, measure_opacity_coverage
-from vdgs.evaluation.renderable_model import EvaluationSettings, ReferenceViews, RenderableModel
+from vdgs.evaluation.renderable_model import EvaluationSettings, ReferenceViews, RenderableModel, RenderedView
 from vdgs.evaluation.splat_artifacts import floater_share, needle_share, training_view_angles
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.system.documents import JsonObject
 
@@ -94,9 +95,9 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
     covered = _covered(view, inputs.model, mask)
     if settings.covered_only:
         mask = covered
-    neutral, seconds = _render(view, inputs.model)
+    plain, seconds = _render(view, inputs.model, inputs.model.render)
     exposure = None if inputs.model.exposure is None else inputs.model.exposure(view)
-    rendered = neutral if exposure is None else neutral.with_exposure(exposure)
+    rendered = plain if exposure is None else plain.with_exposure(exposure)
     image = metrics.to_8bit(rendered.image)
     comparison_images.write_png(inputs.output / "renders" / f"{stem}.png", image)
     figures, maps = _compare(image, reference, mask, "")
@@ -111,6 +112,8 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
         **dict.fromkeys((*CORRECTED_KEYS, *AFFINE_KEYS)),
     }
     if exposure is not None:
+        in_neutral = inputs.model.render_neutral
+        neutral = plain if in_neutral is None else _render(view, inputs.model, in_neutral)[0]
         row |= _compare(metrics.to_8bit(neutral.image), reference, mask, "_reference_exposure")[0]
     if settings.color_correction:
         correction = correct_colors(image, reference, mask)
@@ -165,12 +168,12 @@ def _load_reference(
     return reference, mask
 
 
-def _render(view: View, model: RenderableModel) -> tuple[RenderedImage, float]:
-    """The render and the seconds it took, the GPU's work included."""
+def _render(view: View, model: RenderableModel, draw: Callable[[Camera], RenderedView]) -> tuple[RenderedImage, float]:
+    """A render of the model and the seconds it took, the GPU's work included."""
     with torch.inference_mode():
         _wait_for_gpu()
         start = time.perf_counter()
-        rendered = model.render(view.camera)
+        rendered = draw(view.camera)
         _wait_for_gpu()
         seconds = time.perf_counter() - start
         image, alpha = (

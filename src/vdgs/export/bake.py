@@ -13,7 +13,7 @@ splat of each view, 4 for each Gaussian, and what a part needs (`ANCHORS_PER_PAR
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from vdgs.kernels import get_backend
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decode_world import decode_world, gaussian_means
 from vdgs.model.gaussians import Gaussians
+from vdgs.model.local_exposure import apply_departures
 from vdgs.model.renderer import decode_view
 
 #: A splat that makes less of a view than so many pixels did not show there.
@@ -186,7 +187,11 @@ def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple
     for first, last, decoder in model.decoder_ranges():
         low, high = torch.searchsorted(rows, rows.new_tensor([first, last])).tolist()
         if low < high:
-            pieces.append(decode_world(anchors, rows[low:high], decoder.weights_for_image(None), camera))
+            piece = decode_world(anchors, rows[low:high], decoder.weights_for_image(None), camera)
+            if model.local_exposure is not None:
+                departures = model.local_exposure.at(anchors.positions[rows[low:high]])[:, None]
+                piece = replace(piece, colors=apply_departures(piece.colors, departures))
+            pieces.append(piece)
     # Rows of all k Gaussians of an anchor, in one column.
     spread = place * k + offset
     opacities, colors, scales, quaternions = (

@@ -57,9 +57,11 @@ def measure_loss(
     run: OpenedRun, chunks: Iterable[Gaussians], after_view: Callable[[], None] = lambda: None
 ) -> ExportLoss:
     """Draw `views_to_measure` with the model and with Gaussians, which are in the ground frame, and compare both with
-    the photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were
-    fitted: files hold neutral colors. Of the pieces only what those views show is kept in memory."""
-    views, exposure = views_to_measure(run), make_exposures(run.model, run.capture)
+    the photographs, in 8 bits as all metrics. Files hold neutral colors: where exposures were fitted, both are compared
+    as `vdgs eval` compares in the exposure of each view, or in neutral colors where these are of the local exposure
+    (`AnchorModel.local_exposure`). Of the pieces only what those views show is kept in memory."""
+    views = views_to_measure(run)
+    exposure = make_exposures(run.model, run.capture) if run.model.local_exposure is None else None
     gaussians = _seen(chunks, [view.camera for view in views])
     visibility = make_visibility_map(with_coarse_model(run))
     names = [f"{figure}{whose}" for figure in ("squared_error", "ssim") for whose in ("", "_baked")]

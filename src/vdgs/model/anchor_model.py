@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,10 +23,13 @@ from vdgs.errors import VdgsError
 from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
+from vdgs.model.local_exposure import LocalExposure
 from vdgs.model.model_metadata import ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT, NO_METADATA, ModelMetadata
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.tensors import REBUILD_HINT, read_tensors, tensors_crc32, write_tensors
 
+#: The name of `AnchorModel.local_exposure` in a file.
+LOCAL_EXPOSURE = "local_exposure"
 #: Anchors checked at once.
 CHECK_CHUNK = 1 << 16
 
@@ -54,6 +58,8 @@ class AnchorModel:
     metadata: ModelMetadata = NO_METADATA
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
     decoder_spans: tuple[DecoderSpan, ...] = ()
+    #: What photographs of a place depart by in the mean, which colors are drawn with; None: one exposure for all.
+    local_exposure: LocalExposure | None = None
 
     @property
     def envmap(self) -> Float[Tensor, "rows columns 3"] | None:
@@ -75,7 +81,15 @@ class AnchorModel:
     def to(self, device: torch.device) -> AnchorModel:
         """The same model on a device."""
         parts = tuple(replace(part, decoder=part.decoder.to(device)) for part in self.decoder_spans)
-        return replace(self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), decoder_spans=parts)
+        exposure = None if self.local_exposure is None else self.local_exposure.to(device)
+        return replace(
+            self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), decoder_spans=parts,
+            local_exposure=exposure,
+        )  # fmt: skip
+
+    def without_local_exposure(self) -> AnchorModel:
+        """The model in one exposure for all, from which the exposures of photographs depart (`Decoder.exposure`)."""
+        return self if self.local_exposure is None else replace(self, local_exposure=None)
 
     def with_all_levels(self) -> AnchorModel:
         """The model of which every view draws all levels of the anchors; itself where they have none."""
@@ -97,8 +111,11 @@ class AnchorModel:
             "background": self.background,
             "photograph_pixel": self.photograph_pixel,
             "facts": self.metadata.to_dict(),
-            "crc32": tensors_crc32(tensors),
         }
+        if (local := self.local_exposure) is not None:
+            tensors[LOCAL_EXPOSURE] = local.departures
+            content[LOCAL_EXPOSURE] = [local.x, local.y, local.spacing]
+        content["crc32"] = tensors_crc32(tensors)
         if self.decoder_spans:
             content["parts"] = [part.count for part in self.decoder_spans]
         # A single key: several would be written in an order that varies.
@@ -132,6 +149,7 @@ class AnchorModel:
                 anchors=anchors, decoder=decoder, voxel_size=float(known["voxel"]), background=(red, green, blue),
                 photograph_pixel=_pixel_size(known["photograph_pixel"]),
                 metadata=ModelMetadata.from_dict(known["facts"]), decoder_spans=parts,
+                local_exposure=_local_exposure(tensors, known),
             )  # fmt: skip
             if checked:
                 model.check()
@@ -155,6 +173,8 @@ class AnchorModel:
             raise ValueError(f"max_pixels is {largest.dtype} {tuple(largest.shape)}, not {n} numbers above 0")
         for _, decoder in self._decoders():
             decoder.check(k)
+        if self.local_exposure is not None:
+            self.local_exposure.check()
         total = sum(span.count for span in self.decoder_spans)
         if self.decoder_spans and total != n:
             raise ValueError(f"its parts hold {total} anchors, not {n}")
@@ -169,6 +189,13 @@ def _pixel_size(value: float) -> float:
     if not 0.0 <= value < math.inf:
         raise ValueError(f"its pixels are of size {value!r}")
     return float(value)
+
+
+def _local_exposure(tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> LocalExposure | None:
+    if LOCAL_EXPOSURE not in tensors:
+        return None
+    x, y, spacing = map(float, header[LOCAL_EXPOSURE])
+    return LocalExposure(tensors[LOCAL_EXPOSURE], x, y, spacing)
 
 
 def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:

@@ -19,6 +19,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.envmap import ray_directions, sample_envmap
 from vdgs.model.levels import pixel_sizes
+from vdgs.model.local_exposure import apply_departures
 
 
 @runtime_checkable
@@ -139,6 +140,9 @@ def decode_view(
     if model.anchors.opacity_factors is not None:
         factors = model.anchors.opacity_factors[rows].flatten()[splats.source.long()]
         splats = replace(splats, opacities=splats.opacities * factors)
+    if model.local_exposure is not None:
+        departures = model.local_exposure.at(model.anchors.positions[rows])[splats.source.long() // k]
+        splats = replace(splats, colors=apply_departures(splats.colors, departures))
     return rows, splats
 
 

@@ -80,6 +80,8 @@ def merge_blocks(
             )
         )  # fmt: skip
     merged = replace(coarse, anchors=_concatenate(selected))
+    if config.reference_exposure == "global":
+        merged = merged.without_local_exposure()
     if own_decoder and all(_decoder_bytes(each.decoder) == _decoder_bytes(spans[0].decoder) for each in spans):
         return replace(merged, decoder=replace(spans[0].decoder, envmap=coarse.decoder.envmap)), records
     return replace(merged, decoder_spans=tuple(spans) if own_decoder else ()), records

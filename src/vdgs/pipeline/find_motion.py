@@ -144,7 +144,7 @@ def _keep_residual(opened: OpenedRun, index: int, view: View, unit: float, file:
     if file.exists():
         return
     with torch.no_grad():
-        drawn = render(opened.model, view.camera, depth=True, image_index=index)
+        drawn = render(opened.model.without_local_exposure(), view.camera, depth=True, image_index=index)
         exposure = opened.model.decoder.exposure_for_image(index)
         shown = drawn.image if exposure is None else apply_exposure(drawn.image, exposure)
         depth = drawn.median_depth

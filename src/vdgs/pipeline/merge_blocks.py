@@ -19,6 +19,7 @@ from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 from vdgs.system.quoting import shell_word
 from vdgs.system.tensors import file_id
+from vdgs.training.exposure_centering import with_local_exposure
 
 
 def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: Console) -> None:
@@ -41,9 +42,9 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         reset_peak_memory()
         start = time.monotonic()
         opened = context.open_model("coarse")
-        capture, coarse = opened.capture, opened.model
-        views = capture.train_views
-        cameras = [[views[i].camera for i in indices] for indices in all_block_view_indices(run, capture)]
+        views = opened.capture.train_views
+        coarse = with_local_exposure(opened.model, [view.camera for view in views])
+        cameras = [[views[i].camera for i in indices] for indices in all_block_view_indices(run, opened.capture)]
         trained = [
             partial(load_verified, folder, keys.blocks, index) if done[index] else None
             for index, folder in enumerate(folders)

@@ -39,6 +39,7 @@ from vdgs.system.checkpoints import save_checkpoint
 from vdgs.system.console import show_share
 from vdgs.system.step_progress import StepProgress
 from vdgs.training import TrainingProblem, TrainingState, initial_state, mean_image_color, to_checkpoint
+from vdgs.training.exposure_centering import with_local_exposure
 from vdgs.training.schedule import view_sampling_weights
 from vdgs.training.session.trainer import (
     finish_stage,
@@ -121,7 +122,8 @@ def _train(
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
     )
-    finish_stage(folder, state, state.model(stage, metadata), console)
+    model = with_local_exposure(state.model(stage, metadata), [view.camera for view in capture.train_views])
+    finish_stage(folder, state, model, console)
 
 
 def open_training_images(capture: Capture, config: TrainConfig, budget_bytes: int) -> ImageCache:

@@ -37,6 +37,7 @@ from vdgs.pipeline.train_coarse import (
     show_progress,
 )
 from vdgs.training import StepReport, TrainingProblem, TrainingState, initial_state, train
+from vdgs.training.exposure_centering import with_local_exposure
 from vdgs.training.session.trainer import image_cache_bytes
 from vdgs.visibility.visibility_counts import count_visibility
 
@@ -120,7 +121,7 @@ def _train_coarse(
             "a larger densify.start, and look at the photographs with `vdgs inspect`"
         )
     metadata = ModelMetadata(capture=capture_metadata(capture), version=__version__, iterations=state.iteration)
-    return _result(state, problem, metadata)
+    return with_local_exposure(_result(state, problem, metadata), [view.camera for view in capture.train_views])
 
 
 def _train_block(

@@ -9,22 +9,32 @@ the scene has, and training drifts. Of photograph i let x be (color, 1) of a pix
 is nearest to all exposures, by the squares of the differences in their pixels. After each pass over the photographs, as
 training draws them, M is taken from all departures, and the colors of the scene follow. (The mean of the departures in
 place of M does not see that cameras expose bright places less, nor how alike red, green and blue are.)
+
+A trained scene is drawn in what photographs of each place depart by from that (`with_local_exposure`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.transfer import is_host
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.local_exposure import fit_local_exposure
+from vdgs.model.renderer import render
 
 #: Of each photograph rows and columns are left out until at most so many pixels are left; those are counted where the
 #: scene is at least so opaque.
 MAX_PIXELS, MIN_ALPHA = 30_000, 0.5
+#: Pictures of a trained scene that tell the colors of a photograph have this longest side (choice).
+SMALL_PX = 96
 #: Added to the diagonal of Σ S_i, as a share of its trace: photographs in one color leave M open. And so much alone:
 #: where nothing was counted, M is 0.
 RIDGE, TINY = 1e-7, 1e-30
@@ -52,11 +62,16 @@ def count_exposure(
     counted = alpha[part, part] >= MIN_ALPHA
     if mask is not None:
         counted = counted & (mask[part, part] > 0)
-    pixels = image.detach()[part, part].double()
-    colors = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2) * counted[..., None]
-    of_colors = _sum_of_products(colors.flatten(0, 1)) / counted.sum().clamp(min=1)
+    of_colors = _mean_of_products(image.detach()[part, part], counted)
     moments[:3] += departure.double() @ of_colors
     moments[3:] += of_colors
+
+
+def _mean_of_products(image: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"]) -> Float[Tensor, "4 4"]:
+    """The mean of x xᵀ over the pixels that count; 0 where none does."""
+    pixels = image.double()
+    colors = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2) * counted[..., None]
+    return _sum_of_products(colors.flatten(0, 1)) / counted.sum().clamp(min=1)
 
 
 def _sum_of_products(colors: Float[Tensor, "p 4"]) -> Float[Tensor, "4 4"]:
@@ -74,3 +89,22 @@ def center_exposures(departures: Float[Tensor, "images 3 4"], moments: ExposureM
     # `solve` would wait for a GPU to see whether it could.
     departures -= torch.linalg.solve_ex(of_colors, moments[:3].T)[0].T.to(departures)
     moments.zero_()
+
+
+def with_local_exposure(model: AnchorModel, cameras: Sequence[Camera]) -> AnchorModel:
+    """A trained model, in the exposure that photographs of a place have in the mean (`AnchorModel.local_exposure`), if
+    exposures were fitted; itself where it has one. `cameras` are those of the training photographs."""
+    exposure, positions = model.decoder.exposure, model.anchors.positions
+    if exposure is None or model.local_exposure is not None:
+        return model
+    moments = torch.stack([_color_moments(model, camera) for camera in cameras])
+    found = fit_local_exposure(exposure, moments, cameras, positions)
+    return replace(model, local_exposure=found.to(positions.device))
+
+
+def _color_moments(model: AnchorModel, camera: Camera) -> Float[Tensor, "4 4"]:
+    """S of a photograph, by a small picture of the scene."""
+    shrunk = min(1.0, SMALL_PX / max(camera.width, camera.height))
+    width, height = (max(1, round(shrunk * side)) for side in (camera.width, camera.height))
+    drawn = render(model, camera.resized(width, height))
+    return _mean_of_products(drawn.image, drawn.alpha >= MIN_ALPHA)

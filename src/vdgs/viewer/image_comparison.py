@@ -13,6 +13,7 @@ from vdgs.captures.camera_height import camera_height
 from vdgs.captures.image_cache import resize_area
 from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
 from vdgs.viewer.viewer_scene import ViewerScene
 
@@ -76,9 +77,12 @@ class ImageComparison:
 
     def _compute_error_map(self, name: str, index: int) -> ImageErrorMap:
         view = self._scene.capture.views[index]
-        camera, exposures = view.camera.limit_size(_MAX_COMPARE_PX), self._scene.exposures(name)
+        camera = view.camera.limit_size(_MAX_COMPARE_PX)
         photograph = resize_area(self._scene.images.get(index), camera.width, camera.height)
-        raster = render(self._scene.shown(name, camera), camera, depth=True)
+        shown, exposures = self._scene.shown(name, camera), self._scene.exposures(name)
+        if exposures is not None and isinstance(shown, AnchorModel):
+            shown = shown.without_local_exposure()
+        raster = render(shown, camera, depth=True)
         assert raster.median_depth is not None
         drawn = raster.image.cpu().numpy()
         if exposures is not None:

@@ -218,13 +218,16 @@ class ViewerScene:
 
     def exposures(self, name: str) -> ViewExposures | None:
         """The exposures that views are compared in with a model, as `vdgs eval` has them but for what is metered of
-        decimated models; None where training fitted none."""
+        decimated models; None where training fitted none, and for a tree in the local exposure."""
 
         def render_decimated(camera: Camera) -> Raster:
-            return render(self.get_level(name, camera, _METERING_MAX_ANCHORS)[0].model, camera)
+            level = self.get_level(name, camera, _METERING_MAX_ANCHORS)[0].model
+            return render(level.without_local_exposure() if isinstance(level, AnchorModel) else level, camera)
 
         if name not in self._exposures:
-            self._exposures[name] = make_exposures(self.model(name), self.capture, render_decimated)
+            model = self.model(name)
+            has_none = model.local_exposure is not None and self.tree(name) is not None
+            self._exposures[name] = None if has_none else make_exposures(model, self.capture, render_decimated)
         return self._exposures[name]
 
     @cached_property

@@ -187,7 +187,7 @@ def _rendered_scores(
     model: AnchorModel, members: _BlockMembers, camera: Camera, config: AssignmentConfig
 ) -> tuple[list[float], list[float]]:
     """The scores of one camera for every block in a mode that renders, and its coverage."""
-    rows, splats = decode_view(model, camera)
+    rows, splats = decode_view(model.without_local_exposure(), camera)
     anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
     full = rasterize_splats(splats, camera, splats.means_px.new_zeros(3))
     owner, reached = members.owner[anchor], members.reached[:, anchor]

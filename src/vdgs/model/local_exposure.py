@@ -1,0 +1,135 @@
+"""The exposure that photographs of a place have in the mean: in it a finished scene is drawn.
+
+Training draws the scene as one exposure for all would show it, and photographs depart from that
+(`model.exposure`): where a cloud passed, or fields are bright, all photographs of a place are darker or brighter
+together. Pictures, maps and files of the scene follow them here, smoothly, from the departures D_i of photographs:
+
+    D(p) = (Σ w_i(p) D_i S_i) (Σ w_i(p) S_i)⁻¹,    w_i(p) = 1 / (1 + a² + b²),
+
+with a and b the place of p in photograph i, from -1 to 1 between its sides, and S_i the mean of x xᵀ over its pixels, x
+being (color, 1): of all departures D(p) is nearest to those of the photographs, in their colors
+(`training.exposure_centering`). A color c is drawn as c + D(p) [c, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from vdgs.geometry.camera import Camera
+
+#: Cells along the longer side of the grid: a photograph shows many of them (choice).
+CELLS = 64
+#: The grid reaches over so much of the anchors along x and y, which leaves out what is far away; beyond it the value at
+#: its border holds.
+INNER_SHARE = 0.98
+#: Added to the diagonal of Σ w_i S_i, as a share of its trace, and so much alone: photographs in one color leave D
+#: open, and where none counts it is 0.
+RIDGE, TINY = 1e-7, 1e-30
+#: Places that are no farther along the axis of a camera, in units of the ground frame, are not before it.
+_NEAREST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class LocalExposure:
+    """D(p) on a grid of places x, y of the ground frame."""
+
+    departures: Float[Tensor, "rows columns 3 4"]
+    #: Of the first node of the grid, and between nodes, in units of the ground frame.
+    x: float
+    y: float
+    spacing: float
+
+    def at(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 4"]:
+        """Bilinear between the nodes; beyond the grid that of its border."""
+        rows, columns = self.departures.shape[:2]
+        i, from_i = _cells((places[:, 1] - self.y) / self.spacing, rows)
+        j, from_j = _cells((places[:, 0] - self.x) / self.spacing, columns)
+        flat = self.departures.flatten(0, 1).flatten(1)
+        below, above = (
+            _between(flat[row * columns + j], flat[row * columns + (j + 1).clamp(max=columns - 1)], from_j)
+            for row in (i, (i + 1).clamp(max=rows - 1))
+        )
+        return _between(below, above, from_i).unflatten(1, (3, 4))
+
+    def to(self, device: torch.device) -> LocalExposure:
+        return replace(self, departures=self.departures.to(device))
+
+    def check(self) -> None:
+        """Raise ValueError unless the grid is one, of finite numbers."""
+        shape = tuple(self.departures.shape)
+        if len(shape) != 4 or shape[2:] != (3, 4) or not all(shape):
+            raise ValueError(f"local exposure has shape {shape}, not [rows, columns, 3, 4]")
+        if not (bool(torch.isfinite(self.departures).all()) and 0 < self.spacing < np.inf):
+            raise ValueError("local exposure holds numbers that are not finite")
+
+
+def _cells(places: Float[Tensor, " n"], count: int) -> tuple[Int64[Tensor, " n"], Float[Tensor, "n 1"]]:
+    """The node before each place, and how far the place is from it."""
+    places = places.clamp(0, count - 1)
+    first = places.floor()
+    return first.long(), (places - first)[:, None]
+
+
+def _between(first: Float[Tensor, "n 12"], second: Float[Tensor, "n 12"], share: Float[Tensor, "n 1"]) -> Tensor:
+    """Linear. In products and sums alone, here and below: `lerp` and sums over a dimension may round otherwise by where
+    in a tensor a value stands, and so by the number of threads."""
+    return first * (1 - share) + second * share
+
+
+def apply_departures(colors: Float[Tensor, "*n 3"], departures: Float[Tensor, "*#n 3 4"]) -> Float[Tensor, "*n 3"]:
+    """c + D [c, 1] of colors c with a departure D each, or for several."""
+    red, green, blue = (departures[..., channel] * colors[..., channel, None] for channel in range(3))
+    return colors + (red + green + blue + departures[..., 3])
+
+
+def fit_local_exposure(
+    departures: Float[Tensor, "images 3 4"],
+    color_moments: Float[Tensor, "images 4 4"],
+    cameras: Sequence[Camera],
+    positions: Float[Tensor, "n 3"],
+) -> LocalExposure:
+    """D(p) of photographs, their S_i and their cameras, over the places of a scene's anchors."""
+    x, y, spacing, places = _grid(positions.detach().cpu().double().numpy())
+    of_image, moments = (each.detach().cpu().double().numpy() for each in (departures, color_moments))
+    departed, of_colors = np.zeros((*places.shape[:2], 3, 4)), np.zeros((*places.shape[:2], 4, 4))
+    for camera, departure, moment in zip(cameras, of_image, moments, strict=True):
+        weight = _weights(camera, places)[..., None, None]
+        departed += weight * (departure @ moment)
+        of_colors += weight * moment
+    ridge = RIDGE * np.trace(of_colors, axis1=2, axis2=3) + TINY
+    of_colors += ridge[..., None, None] * np.eye(4)
+    # Both sides transposed: of_colors is symmetric.
+    found = np.linalg.solve(of_colors, departed.swapaxes(2, 3)).swapaxes(2, 3)
+    return LocalExposure(torch.from_numpy(np.ascontiguousarray(found)).float(), x, y, spacing)
+
+
+def _weights(camera: Camera, places: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns"]:
+    pixels, depths = camera.project(places.reshape(-1, 3))
+    aside = 2 * pixels / (camera.width, camera.height) - 1
+    weights = np.where(depths > _NEAREST, 1 / (1 + (aside**2).sum(axis=1)), 0.0)
+    return weights.reshape(places.shape[:2])
+
+
+def _grid(positions: Float[np.ndarray, "n 3"]) -> tuple[float, float, float, Float[np.ndarray, "rows columns 3"]]:
+    """x, y and spacing of a grid over anchors, and its nodes at the height that anchors near by have in the median."""
+    low, high = np.quantile(positions[:, :2], [(1 - INNER_SHARE) / 2, (1 + INNER_SHARE) / 2], axis=0)
+    spacing = float((high - low).max()) / CELLS or 1.0
+    columns, rows = (np.floor((high - low) / spacing).astype(int) + 1).tolist()
+    column, row = np.rint((positions[:, :2] - low) / spacing).astype(int).T
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    node, heights = (row * columns + column)[inside], positions[inside, 2]
+    order = np.lexsort((heights, node))
+    present, first, counts = np.unique(node[order], return_index=True, return_counts=True)
+    z = np.full(rows * columns, np.nan)
+    z[present] = heights[order][first + counts // 2]
+    nearest = distance_transform_edt(np.isnan(z).reshape(rows, columns), return_distances=False, return_indices=True)
+    z = z.reshape(rows, columns)[tuple(nearest)]
+    x, y = low[0] + spacing * np.arange(columns), low[1] + spacing * np.arange(rows)
+    return float(low[0]), float(low[1]), spacing, np.stack([*np.meshgrid(x, y), z], axis=-1)

@@ -1,0 +1,158 @@
+"""Laws of the exposure that photographs of a place have in the mean, and what draws with it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.hand_made_models import camera_above, model_at, opaque_plane, quadrants
+from vdgs.config.method import MergeConfig
+from vdgs.errors import VdgsError
+from vdgs.export.bake import bake, collect_contributions
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.exposure import apply_exposure, exposure_matrix
+from vdgs.model.local_exposure import LocalExposure, apply_departures, fit_local_exposure
+from vdgs.model.renderer import render
+from vdgs.partition.merging import merge_blocks
+
+GRID = LocalExposure(torch.arange(2 * 3 * 12).float().view(2, 3, 3, 4), x=-1.0, y=2.0, spacing=0.5)
+ONE = torch.tensor([[0.1, -0.05, 0.02, 0.03], [0.0, -0.2, 0.04, -0.01], [0.05, 0.0, 0.3, 0.02]])
+
+
+def colors_of(images: int) -> torch.Tensor:
+    """The mean of x xᵀ over the pixels of each of some photographs."""
+    colors = torch.rand(images, 500, 3, generator=torch.Generator().manual_seed(images))
+    pixels = torch.cat([colors, torch.ones(images, 500, 1)], dim=2)
+    return pixels.transpose(1, 2) @ pixels / 500
+
+
+def everywhere(departure: torch.Tensor) -> LocalExposure:
+    return LocalExposure(departure.view(1, 1, 3, 4), 0.0, 0.0, 1.0)
+
+
+def test_between_nodes_it_is_bilinear_and_beyond_the_grid_that_of_the_border():
+    nodes = GRID.departures
+    places = torch.tensor([[-1.0, 2, 7], [-0.5, 2.5, 0], [-0.25, 2.25, 0], [9, 2.25, 0], [-9, -9, 0]])
+    expected = [
+        nodes[0, 0], nodes[1, 1], nodes[:, 1:].mean((0, 1)), nodes[:, 2].mean(0), nodes[0, 0]
+    ]  # fmt: skip
+    assert torch.allclose(GRID.at(places), torch.stack(expected))
+    assert GRID.at(places[:0]).shape == (0, 3, 4)
+
+
+def test_the_bits_of_a_place_do_not_depend_on_the_places_beside_it():
+    g = torch.Generator().manual_seed(0)
+    places, colors = 3 * torch.rand(1003, 3, generator=g), torch.rand(1003, 3, generator=g)
+    some = torch.randperm(1003, generator=g)[:77]
+    assert torch.equal(GRID.at(places)[some], GRID.at(places[some]))
+    drawn = apply_departures(colors, GRID.at(places))
+    assert torch.equal(drawn[some], apply_departures(colors[some], GRID.at(places[some])))
+
+
+def test_what_all_photographs_depart_by_holds_everywhere_as_their_exposure():
+    cameras = [camera_above(x, 0.0) for x in (-2.0, 0.0, 2.0)]
+    positions = torch.randn(300, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([3.0, 2.0, 0.1])
+    found = fit_local_exposure(ONE.expand(3, 3, 4), colors_of(3), cameras, positions)
+    assert torch.allclose(found.at(positions), ONE.expand(300, 3, 4), atol=1e-6)
+    picture = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(1))
+    exposed = apply_exposure(picture, exposure_matrix(ONE[None], 0))
+    assert torch.allclose(apply_departures(picture, ONE.expand(4, 5, 3, 4)), exposed, atol=1e-6)
+
+
+def test_a_place_follows_the_photographs_that_show_it():
+    """Two photographs side by side: halfway it is their mean, and under each that one counts most."""
+    cameras = [camera_above(-2.0, 0.0), camera_above(2.0, 0.0)]
+    line = torch.linspace(-4, 4, 801)
+    positions = torch.stack([line, torch.linspace(-1, 1, 801), torch.zeros(801)], 1)
+    found = fit_local_exposure(torch.stack([ONE, -ONE]), colors_of(1).expand(2, 4, 4), cameras, positions)
+    places = torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]])
+    shares = (found.at(places) * ONE).sum((1, 2)) / ONE.square().sum()
+    assert shares[1] == pytest.approx(0.0, abs=0.02)
+    assert shares[0] > 0.4
+    assert shares[2] < -0.4
+
+
+def test_photographs_that_look_away_do_not_count():
+    away = camera_above(0.0, 0.0, altitude=-4.0)  # below the ground, looking down
+    positions = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    found = fit_local_exposure(torch.stack([ONE, 5 * ONE]), colors_of(2), [camera_above(0.0, 0.0), away], positions)
+    assert torch.allclose(found.at(positions), ONE.expand(50, 3, 4), atol=1e-6)
+    assert not fit_local_exposure(ONE[None], colors_of(1), [away], positions).departures.any()
+
+
+@pytest.mark.parametrize("positions", [np.zeros((1, 3)), np.full((4, 3), 2.5), np.c_[np.arange(9.0), np.zeros((9, 2))]])
+def test_scenes_without_extent_have_one_too(positions: np.ndarray):
+    found = fit_local_exposure(ONE[None], colors_of(1), [camera_above(2.0, 0.5)], torch.from_numpy(positions).float())
+    found.check()
+    assert torch.allclose(found.at(torch.zeros(1, 3)), ONE, atol=1e-6)
+
+
+def test_pictures_and_files_have_its_colors_and_nothing_else_changes():
+    plain, camera = opaque_plane(), camera_above(0.0, 0.0)
+    model = replace(plain, local_exposure=everywhere(ONE), background=(0.0, 0.0, 0.0))
+    plain = replace(plain, background=(0.0, 0.0, 0.0))
+    drawn, before = render(model, camera, depth=True), render(plain, camera, depth=True)
+    assert torch.equal(drawn.alpha, before.alpha)
+    assert torch.equal(drawn.depth, before.depth)
+    expected = before.image + before.image @ ONE[:, :3].T + before.alpha[..., None] * ONE[:, 3]
+    assert torch.allclose(drawn.image, expected, atol=1e-5)
+    assert torch.equal(render(model.without_local_exposure(), camera).image, before.image)
+
+    def baked(of: AnchorModel) -> tuple[torch.Tensor, torch.Tensor]:
+        seen = collect_contributions(of, [camera, camera_above(0.5, 0.0, tilt_deg=20.0)])
+        parts = list(bake(seen, np.flatnonzero(seen.pixels > 1), degree=1))
+        return torch.cat([part.sh0 for part in parts]), torch.cat([part.means for part in parts])
+
+    (colors, means), (base, places) = baked(model), baked(plain)
+    assert torch.equal(means, places)
+    y0 = 0.28209479177387814
+    color, was = 0.5 + y0 * colors.view(-1, 3), 0.5 + y0 * base.view(-1, 3)
+    assert torch.allclose(color, was + was @ ONE[:, :3].T + ONE[:, 3], atol=2e-3)
+
+
+def test_a_model_keeps_it_in_its_file_which_is_checked(tmp_path: Path):
+    model, file = replace(model_at(np.eye(3)), local_exposure=GRID), tmp_path / "model.safetensors"
+    model.save(file)
+    found = AnchorModel.load(file).local_exposure
+    assert found is not None
+    assert torch.equal(found.departures, GRID.departures)
+    assert (found.x, found.y, found.spacing) == (GRID.x, GRID.y, GRID.spacing)
+    replace(model, local_exposure=None).save(file)
+    assert AnchorModel.load(file).local_exposure is None
+    for bad in (replace(GRID, departures=GRID.departures / 0), replace(GRID, spacing=0.0)):
+        replace(model, local_exposure=bad).save(file)
+        with pytest.raises(VdgsError, match="local exposure"):
+            AnchorModel.load(file)
+    model.save(file)
+    file.write_bytes(without_place(file.read_bytes()))
+    with pytest.raises(VdgsError, match="damaged or incomplete"):
+        AnchorModel.load(file)
+
+
+def without_place(content: bytes) -> bytes:
+    """The same file whose header does not say where the grid lies."""
+    (length,) = struct.unpack("<Q", content[:8])
+    header = json.loads(content[8 : 8 + length])
+    (name,) = header["__metadata__"]
+    said = json.loads(header["__metadata__"][name])
+    del said["local_exposure"]
+    header["__metadata__"][name] = json.dumps(said)
+    new = json.dumps(header).encode()
+    return struct.pack("<Q", len(new)) + new + content[8 + length :]
+
+
+def test_the_merge_keeps_it_unless_one_exposure_is_asked_for():
+    g = np.random.default_rng(0)
+    coarse = replace(model_at(g.uniform(-3, 3, (40, 3))), local_exposure=GRID)
+    blocks, cameras = quadrants(), [[camera_above(0.0, 0.0)]] * 4
+    for asked, kept in (("local", GRID), ("global", None)):
+        merged, _ = merge_blocks(
+            coarse, [None] * 4, blocks, cameras, MergeConfig(reference_exposure=asked), allow_missing=True
+        )
+        assert merged.local_exposure is kept
