@@ -24,7 +24,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.sfm import incremental_mapper
-from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy
+from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left
 from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
@@ -185,7 +185,10 @@ def test_heights_of_some_points_make_no_plane_of_a_line():
 BAD = {
     "nothing": ("", "is empty"),
     "no system": (None, "must name the coordinate system"),
-    "XML": ("<?xml version='1.0'?>\n<document version='2.1'><markers/></document>", "must name the coordinate system"),
+    "XML": (
+        "<?xml version='1.0'?>\n<document version='2.1'><markers/></document>",
+        "is XML, .* --gcp takes ODM's list",
+    ),
     "no such system": ({"header": "EPSG:999999"}, "must name the coordinate system"),
     "a word for a number": ([{"text": "1 2 three 4 5 DJI_0001.JPG"}], "line 2: .* is not `x y z px py photograph"),
     "columns in another order": ([{"text": "lat lon alt px py photo"}], "line 2: .* another order than `x y z px py"),
@@ -220,6 +223,16 @@ def test_files_that_are_no_lists_are_refused(flight, tmp_path):
         read_gcp_list(tmp_path / "none.txt", collection, ())
     with pytest.raises(CaptureError, match="not a text file"):
         read_gcp_list(flight.folder / flight.names[0], collection, ())
+    for kind, text in (
+        ("is XML, as Metashape writes markers", '<?xml version="1.0"?>\n<document version="1.5.0">\n</document>\n'),
+        (
+            "without their marks in photographs",
+            "#Label,X,Y,Z\nP1,306231.5,4545350.1,233.6,0.005\nP2,306185.2,4545327.8,234,0.005\n",
+        ),
+    ):
+        (tmp_path / "other.txt").write_text(text)
+        with pytest.raises(CaptureError, match=rf"{kind}\. --gcp takes ODM's list: .* `x y z px py photograph name`"):
+            read_gcp_list(tmp_path / "other.txt", collection, ())
     (tmp_path / "two.txt").write_text("\n".join(listed(flight).splitlines()[:5]))
     with pytest.raises(CaptureError, match=r"2 points .* and 3 are needed.*--check-points all"):
         read_gcp_list(tmp_path / "two.txt", collection, ())
@@ -305,6 +318,20 @@ def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: 
         said,
     )
     return facts, load_capture(output), said.file.getvalue()
+
+
+def test_a_place_is_no_better_known_than_by_what_a_model_leaves_of_its_points():
+    """Nine points of the model itself agree to the last bit; bent by their marks it leaves millimetres."""
+    places = np.random.default_rng(0).uniform(-20, 20, (9, 3))
+    stated = gcp_accuracy(places, places, 9)
+    assert stated.place_m == (0.0, 0.0)
+    left = np.tile([[0.003, 0.004, 0.011], [-0.003, -0.004, np.nan]], (5, 1))[:9]
+    across, up = no_better_than_left(stated, left).place_m
+    assert across == pytest.approx(2.306 * 0.005 / 3, rel=1e-3)  # Student's t of eight
+    assert up == pytest.approx(2.306 * 0.011 * np.sqrt(5 / 9) / 3, rel=1e-3)
+    worse = replace(stated, place_m=(0.5, 0.6))
+    assert no_better_than_left(worse, left) == worse
+    assert no_better_than_left(replace(stated, place_m=None), left).place_m is None
 
 
 def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, points, tmp_path):

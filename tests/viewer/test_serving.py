@@ -331,6 +331,9 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
         assert f"--port {port}" in done.stderr
     with pytest.raises(VdgsError, match="no address of this machine"):
         find_free_port("no.such.host.invalid", None)
+    for port in (None, 8140):
+        with pytest.raises(VdgsError, match=r"--host 192\.0\.2\.7: is no address of this machine\."):  # of RFC 5737
+            find_free_port("192.0.2.7", port)
     with pytest.raises(VdgsError, match="--port 70000"):
         parse(["view", str(run), "--port", "70000"])
 

@@ -105,7 +105,7 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
     if source is None:
         return None, (
             f"LPIPS is null: no VGG16 weights. Download {VGG16_URL} and give --lpips-weights PATH, "
-            f"or put it at {cached}."
+            f"or put it at {cached}." + ("" if head_file else " The linear heads too: pip install 'vdgs[lpips]'.")
         )
     if head_file is None:
         return None, f"LPIPS is null: {NO_HEADS}"

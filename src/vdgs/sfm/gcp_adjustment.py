@@ -210,6 +210,8 @@ def adjust_to_gcps(
         notes = ("too few control points with heights fit the others to bend the model; it is not bent.",)
     else:
         model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in firm], fix_focal, threads)
+    seen = [(k, now) for k in kept if (now := triangulate(model, gcps.points[k])) is not None]
+    accuracy = no_better_than_left(accuracy, np.array([now.position - targets[k] for k, now in seen]).reshape(-1, 3))
     if accuracy.place_m:
         with_datum = float(np.hypot(accuracy.place_m[0], gcps.datum_error_m))
         accuracy = replace(accuracy, place_m=(with_datum, *accuracy.place_m[1:]))
@@ -320,6 +322,19 @@ def gcp_accuracy(placed: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n
         north_deg=float(np.degrees(times * deviation / across)),
         level_deg=float(np.degrees(upright / max(float(spread[1]), 1e-9))), positions_m=None,
     )  # fmt: skip
+
+
+def no_better_than_left(accuracy: AccuracyFacts, left: Float[np.ndarray, "n 3"]) -> AccuracyFacts:
+    """A place that is no better known than by what a finished model leaves of its control points (NaN: no height).
+
+    Points that agree by chance, or were taken from a model, say nothing of their marks, which bend the model.
+    """
+    if not accuracy.place_m or not len(left):
+        return accuracy
+    times = float(stdtrit(max(1, len(left) - 1), 0.975)) / np.sqrt(len(left))
+    east, north, up = times * np.sqrt(np.nan_to_num(left**2).mean(axis=0))
+    across_and_up = (float(np.hypot(east, north)), float(up))
+    return replace(accuracy, place_m=tuple(map(max, accuracy.place_m, across_and_up)))
 
 
 def measure_gcps(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -211,6 +212,7 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float, ...]]:
     lines = [Line(*line) for line in text_lines(file, "control points")]
     if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
+    _check_is_list(lines[0].text, file)
     text, count = join_definition([line.text for line in lines])
     header, lines = Line(lines[0].number, text), lines[count:]
     rows = [Row(line.number, line.text.split()) for line in lines]
@@ -220,6 +222,21 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float, ...]]:
         return header.text, rows, (1.0, 1.0, 1.0)
     _check_order(rows[0], file)
     return header.text, rows[1:], tuple(map(meters_of, (rows[0].words + 3 * [""])[:3]))
+
+
+def _check_is_list(first: str, file: Path) -> None:
+    """Raise CaptureError for what programs export of control points without, or otherwise with, their marks."""
+    words = re.split(r"[\s,;]+", first)
+    kind = ""
+    if first.lstrip("\ufeff").startswith("<"):
+        kind = "XML, as Metashape writes markers"
+    elif not _is_number(words[0]) and len(words) > 3 and all(map(_is_number, words[1:4])):
+        kind = "a table of points without their marks in photographs"
+    if kind:
+        raise CaptureError(
+            f"{file}: is {kind}. --gcp takes ODM's list: a line that names the coordinate system (EPSG:32615), and for "
+            "each mark a line `x y z px py photograph name`."
+        )
 
 
 def _check_order(names: Row, file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import http
 import io
@@ -211,6 +212,8 @@ def find_free_port(host: str, port: int | None) -> int:
         except (socket.gaierror, UnicodeError) as error:
             raise VdgsError(f"--host {host}: is no address of this machine ({error}).") from error
         except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise VdgsError(f"--host {host}: is no address of this machine.") from error
             why = error
     if port is None:
         raise VdgsError(f"--host {host}: none of the ports {tried[0]} to {tried[-1]} can be used ({why}). Give --port.")
