@@ -32,6 +32,11 @@ def colors_of(images: int) -> torch.Tensor:
     return pixels.transpose(1, 2) @ pixels / 500
 
 
+def each_of(planes: torch.Tensor) -> torch.Tensor:
+    """D of each place, [n, 3, 4]."""
+    return planes.T.unflatten(1, (3, 4))
+
+
 def everywhere(departure: torch.Tensor) -> LocalExposure:
     return LocalExposure(departure.view(1, 1, 3, 4), 0.0, 0.0, 1.0)
 
@@ -42,27 +47,28 @@ def test_between_nodes_it_is_bilinear_and_beyond_the_grid_that_of_the_border():
     expected = [
         nodes[0, 0], nodes[1, 1], nodes[:, 1:].mean((0, 1)), nodes[:, 2].mean(0), nodes[0, 0]
     ]  # fmt: skip
-    assert torch.allclose(GRID.at(places), torch.stack(expected))
-    assert GRID.at(places[:0]).shape == (0, 3, 4)
+    assert torch.allclose(each_of(GRID.at(places)), torch.stack(expected))
+    assert GRID.at(places[:0]).shape == (12, 0)
 
 
 def test_the_bits_of_a_place_do_not_depend_on_the_places_beside_it():
     g = torch.Generator().manual_seed(0)
     places, colors = 3 * torch.rand(1003, 3, generator=g), torch.rand(1003, 3, generator=g)
     some = torch.randperm(1003, generator=g)[:77]
-    assert torch.equal(GRID.at(places)[some], GRID.at(places[some]))
-    drawn = apply_departures(colors, GRID.at(places))
-    assert torch.equal(drawn[some], apply_departures(colors[some], GRID.at(places[some])))
+    assert torch.equal(GRID.at(places)[:, some], GRID.at(places[some]))
+    drawn = apply_departures(colors, GRID.at(places), torch.arange(1003))
+    assert torch.equal(drawn[some], apply_departures(colors[some], GRID.at(places), some))
 
 
 def test_what_all_photographs_depart_by_holds_everywhere_as_their_exposure():
     cameras = [camera_above(x, 0.0) for x in (-2.0, 0.0, 2.0)]
     positions = torch.randn(300, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([3.0, 2.0, 0.1])
     found = fit_local_exposure(ONE.expand(3, 3, 4), colors_of(3), cameras, positions)
-    assert torch.allclose(found.at(positions), ONE.expand(300, 3, 4), atol=1e-6)
+    assert torch.allclose(each_of(found.at(positions)), ONE.expand(300, 3, 4), atol=1e-6)
     picture = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(1))
     exposed = apply_exposure(picture, exposure_matrix(ONE[None], 0))
-    assert torch.allclose(apply_departures(picture, ONE.expand(4, 5, 3, 4)), exposed, atol=1e-6)
+    drawn = apply_departures(picture.flatten(0, 1), ONE.view(12, 1), torch.zeros(20, dtype=torch.long))
+    assert torch.allclose(drawn.view(4, 5, 3), exposed, atol=1e-6)
 
 
 def test_a_place_follows_the_photographs_that_show_it():
@@ -72,7 +78,7 @@ def test_a_place_follows_the_photographs_that_show_it():
     positions = torch.stack([line, torch.linspace(-1, 1, 801), torch.zeros(801)], 1)
     found = fit_local_exposure(torch.stack([ONE, -ONE]), colors_of(1).expand(2, 4, 4), cameras, positions)
     places = torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]])
-    shares = (found.at(places) * ONE).sum((1, 2)) / ONE.square().sum()
+    shares = (each_of(found.at(places)) * ONE).sum((1, 2)) / ONE.square().sum()
     assert shares[1] == pytest.approx(0.0, abs=0.02)
     assert shares[0] > 0.4
     assert shares[2] < -0.4
@@ -82,7 +88,7 @@ def test_photographs_that_look_away_do_not_count():
     away = camera_above(0.0, 0.0, altitude=-4.0)  # below the ground, looking down
     positions = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
     found = fit_local_exposure(torch.stack([ONE, 5 * ONE]), colors_of(2), [camera_above(0.0, 0.0), away], positions)
-    assert torch.allclose(found.at(positions), ONE.expand(50, 3, 4), atol=1e-6)
+    assert torch.allclose(each_of(found.at(positions)), ONE.expand(50, 3, 4), atol=1e-6)
     assert not fit_local_exposure(ONE[None], colors_of(1), [away], positions).departures.any()
 
 
@@ -90,7 +96,7 @@ def test_photographs_that_look_away_do_not_count():
 def test_scenes_without_extent_have_one_too(positions: np.ndarray):
     found = fit_local_exposure(ONE[None], colors_of(1), [camera_above(2.0, 0.5)], torch.from_numpy(positions).float())
     found.check()
-    assert torch.allclose(found.at(torch.zeros(1, 3)), ONE, atol=1e-6)
+    assert torch.allclose(each_of(found.at(torch.zeros(1, 3))), ONE[None], atol=1e-6)
 
 
 def test_pictures_and_files_have_its_colors_and_nothing_else_changes():

@@ -189,8 +189,10 @@ def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple
         if low < high:
             piece = decode_world(anchors, rows[low:high], decoder.weights_for_image(None), camera)
             if model.local_exposure is not None:
-                departures = model.local_exposure.at(anchors.positions[rows[low:high]])[:, None]
-                piece = replace(piece, colors=apply_departures(piece.colors, departures))
+                departures = model.local_exposure.at(anchors.positions[rows[low:high]])
+                anchor = torch.arange((high - low) * k, device=rows.device) // k
+                colors = apply_departures(piece.colors.flatten(0, 1), departures, anchor)
+                piece = replace(piece, colors=colors.unflatten(0, (-1, k)))
             pieces.append(piece)
     # Rows of all k Gaussians of an anchor, in one column.
     spread = place * k + offset

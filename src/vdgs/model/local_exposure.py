@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int, Int32
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -46,17 +46,18 @@ class LocalExposure:
     y: float
     spacing: float
 
-    def at(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 4"]:
-        """Bilinear between the nodes; beyond the grid that of its border."""
+    def at(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "12 n"]:
+        """D of places, its rows one after the other: bilinear between the nodes; beyond the grid that of its border."""
         rows, columns = self.departures.shape[:2]
-        i, from_i = _cells((places[:, 1] - self.y) / self.spacing, rows)
-        j, from_j = _cells((places[:, 0] - self.x) / self.spacing, columns)
-        flat = self.departures.flatten(0, 1).flatten(1)
-        below, above = (
-            _between(flat[row * columns + j], flat[row * columns + (j + 1).clamp(max=columns - 1)], from_j)
-            for row in (i, (i + 1).clamp(max=rows - 1))
-        )
-        return _between(below, above, from_i).unflatten(1, (3, 4))
+        i, above = _nodes((places[:, 1] - self.y) / self.spacing, rows)
+        j, beside = _nodes((places[:, 0] - self.x) / self.spacing, columns)
+        planes = self.departures.reshape(rows * columns, 12).T.contiguous()  # each is gathered and drawn by itself
+
+        def along(row: Int32[Tensor, " n"]) -> Float[Tensor, "12 n"]:
+            first, second = (row * columns + column for column in (j, (j + 1).clamp(max=columns - 1)))
+            return _between(planes.index_select(1, first), planes.index_select(1, second), beside)
+
+        return _between(along(i), along((i + 1).clamp(max=rows - 1)), above)
 
     def to(self, device: torch.device) -> LocalExposure:
         return replace(self, departures=self.departures.to(device))
@@ -70,23 +71,30 @@ class LocalExposure:
             raise ValueError("local exposure holds numbers that are not finite")
 
 
-def _cells(places: Float[Tensor, " n"], count: int) -> tuple[Int64[Tensor, " n"], Float[Tensor, "n 1"]]:
+def _nodes(places: Float[Tensor, " n"], count: int) -> tuple[Int32[Tensor, " n"], Float[Tensor, " n"]]:
     """The node before each place, and how far the place is from it."""
     places = places.clamp(0, count - 1)
     first = places.floor()
-    return first.long(), (places - first)[:, None]
+    return first.int(), places - first
 
 
-def _between(first: Float[Tensor, "n 12"], second: Float[Tensor, "n 12"], share: Float[Tensor, "n 1"]) -> Tensor:
-    """Linear. In products and sums alone, here and below: `lerp` and sums over a dimension may round otherwise by where
-    in a tensor a value stands, and so by the number of threads."""
-    return first * (1 - share) + second * share
+def _between(first: Float[Tensor, "12 n"], second: Float[Tensor, "12 n"], share: Float[Tensor, " n"]) -> Tensor:
+    """Linear; writes into both. In products and sums alone, here and below: `lerp` and sums over a dimension may round
+    otherwise by where in a tensor a value stands, and so by the number of threads."""
+    return first.mul_(1 - share).add_(second.mul_(share))
 
 
-def apply_departures(colors: Float[Tensor, "*n 3"], departures: Float[Tensor, "*#n 3 4"]) -> Float[Tensor, "*n 3"]:
-    """c + D [c, 1] of colors c with a departure D each, or for several."""
-    red, green, blue = (departures[..., channel] * colors[..., channel, None] for channel in range(3))
-    return colors + (red + green + blue + departures[..., 3])
+def apply_departures(
+    colors: Float[Tensor, "m 3"], departures: Float[Tensor, "12 n"], of: Int[Tensor, " m"]
+) -> Float[Tensor, "m 3"]:
+    """c + D [c, 1] of colors c, each with the departure of the place that `of` counts."""
+    planes = [colors[:, channel].contiguous() for channel in range(3)]
+    drawn = torch.empty_like(colors)
+    for channel, plane in enumerate(planes):
+        red, green, blue, constant = departures[4 * channel : 4 * channel + 4].index_select(1, of)
+        sums = red.mul_(planes[0]).add_(green.mul_(planes[1])).add_(blue.mul_(planes[2])).add_(constant)
+        drawn[:, channel] = sums.add_(plane)
+    return drawn
 
 
 def fit_local_exposure(

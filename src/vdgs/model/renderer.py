@@ -141,8 +141,9 @@ def decode_view(
         factors = model.anchors.opacity_factors[rows].flatten()[splats.source.long()]
         splats = replace(splats, opacities=splats.opacities * factors)
     if model.local_exposure is not None:
-        departures = model.local_exposure.at(model.anchors.positions[rows])[splats.source.long() // k]
-        splats = replace(splats, colors=apply_departures(splats.colors, departures))
+        departures = model.local_exposure.at(model.anchors.positions.index_select(0, rows))
+        anchor = splats.source.div(k, rounding_mode="floor")
+        splats = replace(splats, colors=apply_departures(splats.colors, departures, anchor))
     return rows, splats
 
 
