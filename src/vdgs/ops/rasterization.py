@@ -232,9 +232,9 @@ def _projected(gaussians: _Gaussians, settings: _Settings, packed: bool) -> tupl
     columns = zip(*views, strict=True)
     meta: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
     if packed:
-        counts = torch.tensor([len(each) for each in rows], device=gaussians.means.device)
+        counts = torch.tensor([len(each) for each in rows], dtype=torch.int64, device=gaussians.means.device)
         for name, at in (("batch_ids", 0), ("camera_ids", 1)):
-            meta[name] = torch.tensor([place[at] for place in places], device=counts.device).repeat_interleave(counts)
+            meta[name] = counts.new_tensor([place[at] for place in places]).repeat_interleave(counts)
         meta["gaussian_ids"] = torch.cat(rows)
         for name, column in zip(names, columns, strict=True):
             meta[name] = torch.cat([each[chosen] for each, chosen in zip(column, rows, strict=True)])
@@ -297,7 +297,7 @@ def _radii(projected: ProjectedGaussians, opacities: Tensor, settings: _Settings
     extent = (2 * (opacities / ALPHA_MIN).clamp(min=1).log()).sqrt().clamp(max=MAX_EXTENT)
     radii = (extent[:, None] * variances.sqrt()).ceil().nan_to_num()
     low, high = projected.means_px + radii, projected.means_px - radii
-    size = torch.tensor([settings.width, settings.height], device=radii.device)
+    size = radii.new_tensor([settings.width, settings.height])
     shown = projected.valid & (opacities >= ALPHA_MIN) & (radii > settings.radius_clip).any(-1)
     shown &= (low > 0).all(-1) & (high < size).all(-1)
     shown &= (projected.depths > settings.near) & (projected.depths < settings.far)
