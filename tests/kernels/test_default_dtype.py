@@ -143,6 +143,15 @@ def test_results_are_the_same_to_the_last_bit(name, double):
             assert found == expected
 
 
+def test_so_are_gradients_of_a_picture_drawn_before(double):
+    given = splats()
+    moved = given.colors.requires_grad_(True)
+    raster = cpu.rasterize(given, floats(3), 30, 20)
+    (wanted,) = torch.autograd.grad(raster.image.square().sum(), moved, retain_graph=True)
+    double()
+    assert torch.equal(torch.autograd.grad(raster.image.square().sum(), moved)[0], wanted)
+
+
 def test_so_is_a_trained_model(double):
     wanted = bits(run(start(), stage()))
     double()

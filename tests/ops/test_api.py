@@ -104,6 +104,36 @@ def test_a_run_is_opened_and_drawn(run, native_small):
         vdgs.render(run.scene, camera, mode="depths")
 
 
+def test_a_background_is_three_numbers_in_any_form(run):
+    camera = run.scene.cameras[0]
+    wanted = vdgs.render(run.scene, camera, background=(1.0, 0.5, 0.0)).rgb
+    for color in ([1, 0.5, 0], np.array([1, 0.5, 0]), torch.tensor([1, 0.5, 0])):
+        assert torch.equal(vdgs.render(run.scene, camera, background=color).rgb, wanted)
+    for color in ((255, 255, 255), "white", (1, 1, 1, 1), 1.0, np.ones((3, 1)), (0.0, 0.0, np.nan)):
+        with pytest.raises(VdgsError, match=r"^background is .*it must be"):
+            vdgs.render(run.scene, camera, background=color)
+
+
+def test_an_appearance_that_is_not_there_is_named(run):
+    camera = run.scene.cameras[0]
+    for wrong in (10**9, -1, "a", 0.5):
+        with pytest.raises(VdgsError, match=f"^image_index is '?{wrong}'?; it must be"):
+            vdgs.render(run.scene, camera, image_index=wrong)
+    assert torch.equal(*(vdgs.render(run.scene, camera, image_index=each).rgb for each in (1, np.int64(1))))
+
+
+def test_owners_are_told_in_the_kind_that_is_given(run):
+    points = run.scene.positions[:, :2]
+    owners = run.blocks.owner(points)
+    assert owners.dtype == torch.int64
+    assert set(owners.tolist()) == {0, 1}
+    assert run.blocks.owner(points.numpy()).tolist() == owners.tolist()
+    assert run.blocks.owner(points.double().numpy()).tolist() == owners.tolist()
+    for wrong in (run.scene.positions, points[0], points.numpy()[0]):
+        with pytest.raises(ValueError, match=r"points must be \[n, 2\], x and y, not"):
+            run.blocks.owner(wrong)
+
+
 def test_cameras_are_made_of_matrices(run):
     camera = run.scene.cameras[1]
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -353,6 +383,7 @@ def test_wrong_kinds_of_arguments_are_named(capture, coarse):
         (lambda: vdgs.train(capture, {"iterations": 3}), "config must be vdgs.MethodConfig or vdgs.TrainConfig, not d"),
         (lambda: vdgs.train(capture, callbacks=print), "callbacks must be .*Iterable, not builtin.*: give a list of"),
         (lambda: vdgs.train(capture, callbacks=[3]), "each of callbacks must be .*Callable, not int"),
+        (lambda: vdgs.count_visibility(np.full((2, 3), "a"), cameras), "points must hold numbers, not <U1"),
         (lambda: vdgs.train(capture.root, capture_options={}), "capture_options must be vdgs.CaptureOptions, not dict"),
     ):
         with pytest.raises(TypeError, match=name):

@@ -32,7 +32,7 @@ from vdgs.geometry.camera import Camera as Camera
 from vdgs.geometry.camera import check_cameras
 from vdgs.kernels.device_selection import select_device
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.ops.arrays import Array, as_tensor, like
+from vdgs.ops.arrays import Array, as_tensor, check_image_index, like
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
 from vdgs.runs import open_run as runs
@@ -40,6 +40,8 @@ from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
+
+_COLOR = Annotated[tuple[float, float, float], Range(0, 1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +182,13 @@ def render(
     camera: Camera,
     *,
     mode: Literal["rgb", "rgb+depth"] = "rgb",
-    background: tuple[float, float, float] | None = None,
+    background: Sequence[float] | np.ndarray | Tensor | None = None,
     image_index: int | None = None,
 ) -> Render:
     """Draw one view of a scene, without gradients.
 
-    `background` replaces the scene's own, its environment map too; `image_index` selects the appearance of a training
-    photograph, where one was trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
+    `background`, three numbers from 0 to 1, replaces the scene's own, its environment map too; `image_index` selects
+    the appearance of a training photograph, where one was trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
     """
     from vdgs.model.renderer import render as draw
 
@@ -194,11 +196,20 @@ def render(
     check_kind("camera", camera, Camera)
     if mode not in ("rgb", "rgb+depth"):
         raise VdgsError(f"mode={mode!r}: choose rgb or rgb+depth")
-    raster = draw(scene.model, camera, background=background, depth=mode != "rgb", image_index=image_index)
+    color = None if background is None else _checked_color("background", background)
+    index = check_image_index(image_index, (decoder for _, _, decoder in scene.model.decoder_ranges()))
+    raster = draw(scene.model, camera, background=color, depth=mode != "rgb", image_index=index)
     if raster.depth is None or raster.median_depth is None:
         return Render(raster.image, raster.alpha, None, None)
     median = raster.median_depth.masked_fill(raster.median_depth == 0, torch.nan)
     return Render(raster.image, raster.alpha, median, raster.depth / raster.alpha)
+
+
+def _checked_color(name: str, value: Any) -> tuple[float, float, float]:
+    """A color that a caller gave as numbers, an array or a tensor."""
+    numbers = value.tolist() if isinstance(value, (np.ndarray, Tensor)) else value
+    color: tuple[float, float, float] = checked_value(name, numbers, _COLOR)
+    return color
 
 
 def count_visibility(points: Array, cameras: Sequence[Camera]) -> Array:
