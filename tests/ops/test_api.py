@@ -200,6 +200,8 @@ def test_the_stages_are_those_of_the_run(run, coarse):
     assert np.array_equal(assignment.reasons, run.assignment.reasons)
     merged = vdgs.merge(coarse, run.block_scenes, blocks, assignment)
     assert same(merged, run.scene)
+    with pytest.raises(VdgsError, match="at place 0 is of block 1: give the models in the order of the blocks"):
+        vdgs.merge(coarse, run.block_scenes[::-1], blocks, assignment)
     with pytest.raises(ValueError, match=r"not \[5 training cameras, 2 blocks\]"):
         vdgs.merge(coarse, run.block_scenes, blocks, vdgs.assign_cameras(coarse, blocks, coarse.cameras[:2]))
 

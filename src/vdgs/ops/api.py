@@ -319,7 +319,7 @@ def merge(
     """One scene from trained blocks: every place takes its anchors from exactly one block.
 
     `scene` is the coarse scene that the blocks were trained from; the rows of `assignment` are its training cameras.
-    Raises VdgsError for blocks of another coarse scene, ValueError where the numbers do not fit.
+    Raises VdgsError for blocks of another coarse scene or in another order, ValueError where the numbers do not fit.
     """
     from vdgs.partition.merging import merge_blocks
 
