@@ -62,6 +62,10 @@ def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
         file.write_bytes(content)
         with pytest.raises(CaptureError, match=r"000001\.pt: cannot be read as a torch file"):
             load_capture(tmp_path)
+    torch.save({"H": np.float64(48)}, file)
+    with pytest.raises(CaptureError, match=r"000001\.pt: holds other things than tensors.* Save it anew") as refused:
+        load_capture(tmp_path)
+    assert "\x1b" not in str(refused.value)
     torch.save({"H": 48, "W": 64}, file)
     with pytest.raises(CaptureError, match="needs 'intrinsics'"):
         load_capture(tmp_path)
