@@ -122,6 +122,33 @@ def test_an_appearance_that_is_not_there_is_named(run):
     assert torch.equal(*(vdgs.render(run.scene, camera, image_index=each).rgb for each in (1, np.int64(1))))
 
 
+def test_cameras_that_nothing_can_be_drawn_with_are_named(run):
+    camera = run.scene.cameras[0]
+    pose = camera.camera_from_world
+    for said, changes in (
+        ("camera_from_world must be a rotation", {"camera_from_world": np.diag([2.0, 2, 2, 1]) @ pose}),
+        ("camera_from_world must be a rotation", {"camera_from_world": np.diag([-1.0, 1, 1, 1]) @ pose}),
+        ("camera_from_world must be a rotation", {"camera_from_world": pose * np.nan}),
+        ("camera_from_world must be a rotation", {"camera_from_world": pose[:3]}),
+        ("camera_from_world must be a rotation", {"camera_from_world": pose.tolist()}),
+        ("width and height must be whole", {"width": 96.0}),
+        ("width and height must be whole", {"height": 0}),
+        ("fx and fy must be above 0", {"fx": 0.0}),
+        ("fx and fy must be above 0", {"fy": -80.0}),
+        ("fx and fy must be above 0", {"fx": "80"}),
+        ("fx and fy must be above 0", {"cx": np.nan}),
+    ):
+        wrong = replace(camera, **changes)
+        with pytest.raises(VdgsError, match=f"^camera: {said}"):
+            vdgs.render(run.scene, wrong)
+        with pytest.raises(VdgsError, match=f"^each of cameras: {said}"):
+            vdgs.count_visibility(run.scene.positions, [camera, wrong])
+        with pytest.raises(VdgsError, match=f"^camera: {said}"):
+            vdgs.ops.cull(run.scene.positions, run.scene.model.anchors.log_scales, wrong)
+    of_numpy = replace(camera, fx=np.float32(camera.fx))
+    assert torch.equal(vdgs.render(run.scene, of_numpy).rgb, vdgs.render(run.scene, camera).rgb)
+
+
 def test_owners_are_told_in_the_kind_that_is_given(run):
     points = run.scene.positions[:, :2]
     owners = run.blocks.owner(points)

@@ -357,6 +357,22 @@ def test_nothing_is_drawn_as_nothing(packed, mode):
     assert torch.equal(alpha, draw(given, **options)[1])
 
 
+@pytest.mark.parametrize("options", [{}, {"rasterize_mode": "antialiased"}, {"eps2d": 0.1}, {"sh_degree": 1}])
+def test_autocast_changes_nothing(options):
+    given = scene()
+    if "sh_degree" in options:
+        given["colors"] = given["colors"][:, None].repeat(1, 4, 1)
+    results = []
+    for enabled in (False, True):
+        moved = with_gradients(given)
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            picture = draw(moved, **options)[0]
+        picture.square().sum().backward()
+        results.append([picture, *(each.grad for each in moved.values() if each.grad is not None)])
+    assert len(results[0]) == len(given)
+    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+
+
 @pytest.mark.parametrize("mode", ["D", "ED"])
 def test_depths_have_no_background_whatever_is_given(mode):
     given = scene()

@@ -29,7 +29,7 @@ from vdgs.config.type_hints import field_hints
 from vdgs.config.validation_rules import checked_settings, checked_value
 from vdgs.errors import CaptureError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
-from vdgs.geometry.camera import check_cameras
+from vdgs.geometry.camera import check_camera, check_cameras
 from vdgs.kernels.device_selection import select_device
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.ops.arrays import Array, as_tensor, check_image_index, like
@@ -193,7 +193,7 @@ def render(
     from vdgs.model.renderer import render as draw
 
     _check_scene(scene)
-    check_kind("camera", camera, Camera)
+    check_camera("camera", camera)
     if mode not in ("rgb", "rgb+depth"):
         raise VdgsError(f"mode={mode!r}: choose rgb or rgb+depth")
     color = None if background is None else _checked_color("background", background)

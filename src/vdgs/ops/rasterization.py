@@ -120,8 +120,9 @@ def rasterization(
         width=width, height=height, near=near_plane, far=far_plane, radius_clip=radius_clip, eps2d=eps2d,
         antialiased=rasterize_mode == "antialiased", orthographic=camera_model == "ortho",
     )  # fmt: skip
-    meta, images = _projected(gaussians, settings, packed)
-    drawn = [_draw_image(gaussians, settings, image, render_mode, sh_degree) for image in images]
+    with torch.autocast(gaussians.means.device.type, enabled=False):  # the kernels compute in float32
+        meta, images = _projected(gaussians, settings, packed)
+        drawn = [_draw_image(gaussians, settings, image, render_mode, sh_degree) for image in images]
     meta |= {
         "tile_width": -(-width // tile_size), "tile_height": -(-height // tile_size), "width": width, "height": height,
         "tile_size": tile_size, "n_batches": gaussians.num_batches, "n_cameras": gaussians.num_cameras,

@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple
 from torch import Tensor
 
 from vdgs.errors import check_kind
-from vdgs.geometry.camera import Camera
+from vdgs.geometry.camera import Camera, check_camera
 from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import AdamState, AnchorSplats, IsFinite, PhotometricLoss
 from vdgs.model.anchors import Anchors
@@ -24,7 +24,7 @@ def cull(positions: Array, log_scales: Array, camera: Camera) -> Array:
     positions [n, 3] in world units, log_scales [n, 6] (of the offsets' unit and of the Gaussians), float32. Raises
     ValueError for other shapes. Source: Scaffold-GS, section 3.2; the test is `kernels.torch_ref.cull`.
     """
-    check_kind("camera", camera, Camera)
+    check_camera("camera", camera)
     at = to_torch("positions", positions)
     return like(positions, get_backend(at.device).cull(at, to_torch("log_scales", log_scales), camera))
 
@@ -38,8 +38,9 @@ def decode_anchors(
     (None: the mean). Differentiable in the anchors' tensors but positions, and in the decoder's. Source: Scaffold-GS
     eqs. 3-8.
     """
-    for name, value, kind in (("anchors", anchors, Anchors), ("decoder", decoder, Decoder), ("camera", camera, Camera)):
-        check_kind(name, value, kind)
+    check_kind("anchors", anchors, Anchors)
+    check_kind("decoder", decoder, Decoder)
+    check_camera("camera", camera)
     rows = cull_anchors(anchors, camera) if rows is None else to_torch("rows", rows)
     weights = decoder.weights_for_image(check_image_index(image_index, [decoder]))
     return decode_rows(anchors, rows, weights, camera)
@@ -61,7 +62,7 @@ def project(means: Array, quats: Array, scales: Array, camera: Camera) -> Projec
     means [m, 3], quats [m, 4] (wxyz, any length), scales [m, 3], float32; differentiable in all three. Raises
     ValueError for other shapes. Source: 3DGS eq. 5 (EWA).
     """
-    check_kind("camera", camera, Camera)
+    check_camera("camera", camera)
     at = to_torch("means", means)
     found = get_backend(at.device).project(at, to_torch("scales", scales), to_torch("quats", quats), camera)
     return like(means, Projection(found.means_px, found.conics, found.depths, found.valid))
