@@ -117,6 +117,16 @@ def test_without_test_file_the_validation_is_the_test(tmp_path, both):
     assert any("no transforms_test.json" in note and "transforms_val.json are for" in note for note in capture.warnings)
 
 
+def test_transparency_of_a_set_with_points_is_said(tmp_path, both):
+    assert not any("transparent" in note for note in load_capture(tmp_path).warnings)
+    for image in (*tmp_path.glob("train/*.png"), *tmp_path.glob("test/*.png")):
+        with Image.open(image) as photograph:
+            transparent = photograph.convert("RGBA")
+        transparent.save(image)
+    (note,) = [note for note in load_capture(tmp_path).warnings if "transparent" in note]
+    assert f"vdgs sfm {tmp_path} --output CAPTURE makes it white" in note
+
+
 def test_masks_that_frames_name_are_used(tmp_path, both):
     (tmp_path / "m").mkdir()
 

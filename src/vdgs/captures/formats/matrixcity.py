@@ -35,9 +35,11 @@ from vdgs.captures.formats.source_capture import (
     refuse_many_missing,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.captures.image_files import read_header
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
+from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 
 #: The photographs that do not train.
@@ -110,6 +112,12 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     if is_city:
         unit = scales.pop()
         world = WorldPrior(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
+    elif needs_points and any(_is_transparent(view.image_path) for view in views[:1]):
+        warnings += (
+            "what is transparent is left out of training and figures, as by a mask. Figures of sets of Blender are "
+            f"usual on white: without the points beside the set, vdgs sfm {shell_word(root)} --output CAPTURE makes it "
+            "white.",
+        )
     one_split = {view.split for view in views} == {"train"}
     if one_split:  # no test files: the split is ours to choose
         views = [replace(view, split=None) for view in views]
@@ -122,6 +130,10 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         world=world,
         warnings=warnings,
     )
+
+
+def _is_transparent(image: Path | None) -> bool:
+    return image is not None and read_header(image).mode in ("RGBA", "LA", "PA")
 
 
 def _of_a_city(frame: JsonObject) -> bool:
