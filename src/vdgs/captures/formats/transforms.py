@@ -42,6 +42,7 @@ from vdgs.captures.name_resolution import find_in_other_folders, largest_shrunk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
+from vdgs.system.quoting import shell_word
 
 TRANSFORMS_FILE = "transforms.json"
 #: Its lists of photographs, and the side that each is of.
@@ -133,6 +134,10 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
 
 def _file_path(frame: JsonObject, file: Path) -> str:
     path = frame.get("file_path")
+    if "frame_index" in frame and "file_path" not in frame:
+        city = file.absolute().parents[2]
+        here = shell_word(city) if file.absolute().parents[1].name == "train" else "CITY, with it as CITY/train/BLOCK"
+        raise CaptureError(f"{file}: is one block of MatrixCity. Give the folder above train/: {here}")
     if not isinstance(path, str):
         raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
     return path
