@@ -507,7 +507,8 @@ def test_units_are_never_told_by_where_a_set_lies(tmp_path, scene, place):
 
 
 @pytest.mark.parametrize(
-    "named", ["masks/{}.png", "mask/{}.png", "_masks/{}_mask.png", "images/{}_mask.png", "images/{}.png.png"]
+    "named",
+    ["masks/{}.png", "mask/{}.png", "_masks/{}_mask.png", "images/{}_mask.png", "images/{}.png.png", "masks_4/{}.png"],
 )
 def test_masks_of_a_capture_have_any_usual_name(tmp_path, scene, named):
     write_colmap(tmp_path, scene)
