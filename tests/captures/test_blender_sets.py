@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from support.captures import TinyScene, assert_sees_the_scene
 from support.dataset_layouts import halves, write_blender
@@ -100,6 +101,47 @@ def test_a_test_file_without_frames_is_none(tmp_path, both):
     assert len(capture.test_views) > 0
     (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": []}))
     with pytest.raises(CaptureError, match=r"transforms_train\.json: must hold a list 'frames'"):
+        load_capture(tmp_path)
+
+
+def test_without_test_file_the_validation_is_the_test(tmp_path, both):
+    content = (tmp_path / "transforms_test.json").read_text()
+    (tmp_path / "transforms_val.json").write_text(content)
+    capture = load_capture(tmp_path)
+    wanted = [view.name for view in capture.test_views]
+    assert not any("transforms_val" in note for note in capture.warnings)
+    (tmp_path / "transforms_test.json").unlink()
+    capture = load_capture(tmp_path)
+    assert [view.name for view in capture.test_views] == wanted
+    assert len(capture.train_views) == 9
+    assert any("no transforms_test.json" in note and "transforms_val.json are for" in note for note in capture.warnings)
+
+
+def test_transparency_of_a_set_with_points_is_said(tmp_path, both):
+    assert not any("transparent" in note for note in load_capture(tmp_path).warnings)
+    for image in (*tmp_path.glob("train/*.png"), *tmp_path.glob("test/*.png")):
+        with Image.open(image) as photograph:
+            transparent = photograph.convert("RGBA")
+        transparent.save(image)
+    (note,) = [note for note in load_capture(tmp_path).warnings if "transparent" in note]
+    assert f"vdgs sfm {tmp_path} --output CAPTURE makes it white" in note
+
+
+def test_masks_that_frames_name_are_used(tmp_path, both):
+    (tmp_path / "m").mkdir()
+
+    def name_mask(frame: dict) -> None:
+        frame["mask_path"] = f"m/{frame['file_path'].removeprefix('./').replace('/', '_')}"
+        with Image.open(tmp_path / frame["file_path"]) as photograph:
+            Image.new("L", photograph.size, 255).save(tmp_path / frame["mask_path"])
+
+    change_files(tmp_path, name_mask)
+    masks = {view.name: view.mask_path for view in load_capture(tmp_path).views}
+    assert {name: mask and mask.name for name, mask in masks.items()} == {
+        name: name.replace("/", "_") for name in masks
+    }
+    (tmp_path / "m/train_0003.png").unlink()
+    with pytest.raises(CaptureError, match=r"train_0003\.png: no such mask, though 0003\.png is said to have it"):
         load_capture(tmp_path)
 
 

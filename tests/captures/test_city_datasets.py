@@ -62,6 +62,10 @@ def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
         file.write_bytes(content)
         with pytest.raises(CaptureError, match=r"000001\.pt: cannot be read as a torch file"):
             load_capture(tmp_path)
+    torch.save({"H": np.float64(48)}, file)
+    with pytest.raises(CaptureError, match=r"000001\.pt: holds other things than tensors.* Save it anew") as refused:
+        load_capture(tmp_path)
+    assert "\x1b" not in str(refused.value)
     torch.save({"H": 48, "W": 64}, file)
     with pytest.raises(CaptureError, match="needs 'intrinsics'"):
         load_capture(tmp_path)
@@ -130,3 +134,7 @@ def test_matrixcity_blocks(tmp_path, scene):
     both |= {f"test/block_1_test/rgb/{n}": c for n, c in test.cameras.items()}
     assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colors))
     np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
+    with pytest.raises(CaptureError, match=rf"is one block of MatrixCity\..* above train/: {tmp_path}$"):
+        load_capture(tmp_path / "train/block_1")
+    with pytest.raises(CaptureError, match=r"is one block of MatrixCity\..* above train/: CITY, with it as CITY/train"):
+        load_capture(tmp_path / "test/block_1_test")

@@ -159,6 +159,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("block.xml", '<?xml version="1.0"?><BlocksExchange version="3.2"><Block/></BlocksExchange>', "without poses"),
         ("metadata.json", '{"w": 720, "h": 960, "initPose": [0, 0, 0, 1, 0, 0, 0]}', "poses of Record3D"),
         ("metadata.json", '{"poses": [[0, 0, 0, 1, 0, 0, 0], [0, 0', "poses of Record3D"),
+        ("poses_enu.json", '{"poses": [[1.5' + 16 * ", -2e-3" + "], [", "poses of BungeeNeRF"),
         ("metadata.json", '{"h": 960, "perFrameIntrinsicCoeffs": [[0, 0, 0, 1]', "poses of Record3D"),
         ("cameras/17.json", '{"t_00": 1.0, "t_01": 0.0, "t_02": 0.0, "fx": 900}', "poses of Polycam"),
         ("trajectories.txt", "# kapture format: 1.1\n# timestamp, device_id, qw, qx, qy, qz, tx\n", "of Kapture"),
@@ -213,6 +214,48 @@ def test_a_capture_below_whose_photographs_lie_beside_it_is_named_with_them(tmp_
     command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", str(refused.value))
     assert command is not None
     assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
+
+
+@pytest.mark.parametrize("images", ["images/dslr_images_undistorted", "datasets/place/mapping"])
+def test_a_model_whose_photographs_lie_deep_beside_it_is_named_with_them(tmp_path, scene, images):
+    """As ETH3D and hloc have them."""
+    write_images(tmp_path / images, scene)
+    write_colmap(tmp_path, scene, images=None, sparse="outputs/calibration")
+    write_images(tmp_path / "masks", scene)
+    with pytest.raises(CaptureError, match=r"calibration is a COLMAP model of 12 photographs") as refused:
+        load_capture(tmp_path)
+    link = re.search(r"ln -s (\S+) (\S+); vdgs run (\S+) --output RUN", str(refused.value))
+    assert link is not None
+    Path(link[2]).symlink_to(link[1])
+    assert len(load_capture(Path(link[3])).views) == 12
+
+
+def test_a_model_alone_that_is_none_of_the_folder_above_names_the_photographs(tmp_path, scene):
+    write_images(tmp_path / "images", scene)
+    write_colmap(tmp_path, scene, images=None, sparse="calibration")
+    with pytest.raises(CaptureError, match="is a model alone") as refused:
+        load_capture(tmp_path / "calibration")
+    command = re.search(r"vdgs run (\S+) --images (\S+)$", str(refused.value))
+    assert command is not None
+    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
+
+
+def test_photographs_beside_a_capture_are_found_at_its_own_level(tmp_path, scene):
+    """As ScanNet++ has them: SCENE/dslr/nerfstudio and SCENE/dslr/resized_images."""
+    write_transforms(tmp_path / "dslr/nerfstudio", scene)
+    (tmp_path / "dslr/nerfstudio/images").rename(tmp_path / "dslr/resized_images")
+    with pytest.raises(CaptureError, match="nerfstudio is a capture") as refused:
+        load_capture(tmp_path)
+    command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", str(refused.value))
+    assert command is not None
+    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
+
+
+def test_captures_beside_the_one_that_is_named_are_said(tmp_path, scene):
+    for side in ("train", "val"):
+        write_colmap(tmp_path / side, scene)
+    with pytest.raises(CaptureError, match=r"train is a capture: .* --output RUN \(without the photographs of val,"):
+        load_capture(tmp_path)
 
 
 def test_registered_cameras_of_realityscan_are_told_from_tables(tmp_path):
@@ -464,7 +507,8 @@ def test_units_are_never_told_by_where_a_set_lies(tmp_path, scene, place):
 
 
 @pytest.mark.parametrize(
-    "named", ["masks/{}.png", "mask/{}.png", "_masks/{}_mask.png", "images/{}_mask.png", "images/{}.png.png"]
+    "named",
+    ["masks/{}.png", "mask/{}.png", "_masks/{}_mask.png", "images/{}_mask.png", "images/{}.png.png", "masks_4/{}.png"],
 )
 def test_masks_of_a_capture_have_any_usual_name(tmp_path, scene, named):
     write_colmap(tmp_path, scene)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tracemalloc
@@ -326,6 +327,21 @@ def test_lists_beside_the_model_are_read(tmp_path, scene, sparse):
     assert names[5] not in {view.name for view in capture.views}
     (tmp_path / "test.txt").write_text(names[4])
     assert [view.name for view in load_capture(tmp_path, UP).test_views] == [names[4]]
+
+
+@pytest.mark.parametrize("place", [".", "sparse/0"])
+def test_the_lists_of_scannet_are_read(tmp_path, scene, place):
+    names = sorted(scene.cameras)
+    write_colmap(tmp_path, scene)
+    lists = tmp_path / place / "train_test_lists.json"
+    lists.write_text(json.dumps({"train": names[2:], "test": names[:2], "has_masks": False}))
+    assert [view.name for view in load_capture(tmp_path, UP).test_views] == names[:2]
+    for wrong in ("[]", '{"train": []}', '{"test": "a"}', "{"):
+        lists.write_text(wrong)
+        with pytest.raises(CaptureError, match=r"train_test_lists\.json: must hold"):
+            load_capture(tmp_path, UP)
+    (tmp_path / "test.txt").write_text(names[5])
+    assert [view.name for view in load_capture(tmp_path, UP).test_views] == [names[5]]
 
 
 def test_a_capture_may_bring_its_own_lists(folder, scene):

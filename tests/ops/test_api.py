@@ -104,6 +104,63 @@ def test_a_run_is_opened_and_drawn(run, native_small):
         vdgs.render(run.scene, camera, mode="depths")
 
 
+def test_a_background_is_three_numbers_in_any_form(run):
+    camera = run.scene.cameras[0]
+    wanted = vdgs.render(run.scene, camera, background=(1.0, 0.5, 0.0)).rgb
+    for color in ([1, 0.5, 0], np.array([1, 0.5, 0]), torch.tensor([1, 0.5, 0])):
+        assert torch.equal(vdgs.render(run.scene, camera, background=color).rgb, wanted)
+    for color in ((255, 255, 255), "white", (1, 1, 1, 1), 1.0, np.ones((3, 1)), (0.0, 0.0, np.nan)):
+        with pytest.raises(VdgsError, match=r"^background is .*it must be"):
+            vdgs.render(run.scene, camera, background=color)
+
+
+def test_an_appearance_that_is_not_there_is_named(run):
+    camera = run.scene.cameras[0]
+    for wrong in (10**9, -1, "a", 0.5):
+        with pytest.raises(VdgsError, match=f"^image_index is '?{wrong}'?; it must be"):
+            vdgs.render(run.scene, camera, image_index=wrong)
+    assert torch.equal(*(vdgs.render(run.scene, camera, image_index=each).rgb for each in (1, np.int64(1))))
+
+
+def test_cameras_that_nothing_can_be_drawn_with_are_named(run):
+    camera = run.scene.cameras[0]
+    pose = camera.camera_from_world
+    for said, changes in (
+        ("camera_from_world must be a rotation", {"camera_from_world": np.diag([2.0, 2, 2, 1]) @ pose}),
+        ("camera_from_world must be a rotation", {"camera_from_world": np.diag([-1.0, 1, 1, 1]) @ pose}),
+        ("camera_from_world must be a rotation", {"camera_from_world": pose * np.nan}),
+        ("camera_from_world must be a rotation", {"camera_from_world": pose[:3]}),
+        ("camera_from_world must be a rotation", {"camera_from_world": pose.tolist()}),
+        ("width and height must be whole", {"width": 96.0}),
+        ("width and height must be whole", {"height": 0}),
+        ("fx and fy must be above 0", {"fx": 0.0}),
+        ("fx and fy must be above 0", {"fy": -80.0}),
+        ("fx and fy must be above 0", {"fx": "80"}),
+        ("fx and fy must be above 0", {"cx": np.nan}),
+    ):
+        wrong = replace(camera, **changes)
+        with pytest.raises(VdgsError, match=f"^camera: {said}"):
+            vdgs.render(run.scene, wrong)
+        with pytest.raises(VdgsError, match=f"^each of cameras: {said}"):
+            vdgs.count_visibility(run.scene.positions, [camera, wrong])
+        with pytest.raises(VdgsError, match=f"^camera: {said}"):
+            vdgs.ops.cull(run.scene.positions, run.scene.model.anchors.log_scales, wrong)
+    of_numpy = replace(camera, fx=np.float32(camera.fx))
+    assert torch.equal(vdgs.render(run.scene, of_numpy).rgb, vdgs.render(run.scene, camera).rgb)
+
+
+def test_owners_are_told_in_the_kind_that_is_given(run):
+    points = run.scene.positions[:, :2]
+    owners = run.blocks.owner(points)
+    assert owners.dtype == torch.int64
+    assert set(owners.tolist()) == {0, 1}
+    assert run.blocks.owner(points.numpy()).tolist() == owners.tolist()
+    assert run.blocks.owner(points.double().numpy()).tolist() == owners.tolist()
+    for wrong in (run.scene.positions, points[0], points.numpy()[0]):
+        with pytest.raises(ValueError, match=r"points must be \[n, 2\], x and y, not"):
+            run.blocks.owner(wrong)
+
+
 def test_cameras_are_made_of_matrices(run):
     camera = run.scene.cameras[1]
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -170,6 +227,8 @@ def test_the_stages_are_those_of_the_run(run, coarse):
     assert np.array_equal(assignment.reasons, run.assignment.reasons)
     merged = vdgs.merge(coarse, run.block_scenes, blocks, assignment)
     assert same(merged, run.scene)
+    with pytest.raises(VdgsError, match="at place 0 is of block 1: give the models in the order of the blocks"):
+        vdgs.merge(coarse, run.block_scenes[::-1], blocks, assignment)
     with pytest.raises(ValueError, match=r"not \[5 training cameras, 2 blocks\]"):
         vdgs.merge(coarse, run.block_scenes, blocks, vdgs.assign_cameras(coarse, blocks, coarse.cameras[:2]))
 
@@ -353,6 +412,7 @@ def test_wrong_kinds_of_arguments_are_named(capture, coarse):
         (lambda: vdgs.train(capture, {"iterations": 3}), "config must be vdgs.MethodConfig or vdgs.TrainConfig, not d"),
         (lambda: vdgs.train(capture, callbacks=print), "callbacks must be .*Iterable, not builtin.*: give a list of"),
         (lambda: vdgs.train(capture, callbacks=[3]), "each of callbacks must be .*Callable, not int"),
+        (lambda: vdgs.count_visibility(np.full((2, 3), "a"), cameras), "points must hold numbers, not <U1"),
         (lambda: vdgs.train(capture.root, capture_options={}), "capture_options must be vdgs.CaptureOptions, not dict"),
     ):
         with pytest.raises(TypeError, match=name):

@@ -8,6 +8,7 @@ import torch
 
 from support.captures import camera_at
 from vdgs import ops
+from vdgs.errors import VdgsError
 from vdgs.kernels import cpu
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
@@ -72,3 +73,68 @@ def test_adam_moves_the_rows_that_it_is_given_as_torch_does(kind):
     torch.optim.Adam([reference], 0.1, eps=1e-15).step()
     np.testing.assert_allclose(parameter[rows], reference.detach().numpy(), rtol=1e-6)
     np.testing.assert_array_equal(parameter[[1, 3]], start[[1, 3]])
+
+
+def test_what_adam_may_not_write_to_is_refused(tmp_path):
+    np.save(tmp_path / "parameter.npy", np.ones((4, 3), np.float32))
+    mapped, frozen = np.load(tmp_path / "parameter.npy", mmap_mode="r"), np.ones((4, 3), np.float32)
+    frozen.setflags(write=False)
+
+    def step(place: int, array: np.ndarray) -> bool:
+        moved = [np.zeros((4, 3), np.float32) for _ in range(3)]
+        moved[place] = array
+        return ops.sparse_adam_(*moved, np.ones((4, 3), np.float32), None, 1, lr=0.1)
+
+    for place, name in enumerate(("parameter", "first", "second")):
+        for array in (mapped, frozen):
+            with pytest.raises(ValueError, match=f"^{name} is changed in place, and the array is read-only"):
+                step(place, array)
+        with pytest.raises(TypeError, match=f"^{name} is changed in place, and its bytes are swapped"):
+            step(place, np.ones((4, 3), ">f4"))
+    assert (frozen == 1).all()
+    writable = np.load(tmp_path / "parameter.npy", mmap_mode="r+")
+    assert step(0, writable)
+    assert (writable < 1).all()
+
+
+def test_arrays_of_swapped_bytes_are_read():
+    """As PLY files hold them."""
+    given = [np.random.default_rng(0).uniform(0.1, 1, (9, n)).astype(np.float32) for n in (3, 4, 3)]
+    wanted = ops.project(*given, camera_at(0.0, 0.0))
+    found = ops.project(*(each.astype(">f4") for each in given), camera_at(0.0, 0.0))
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_step_is_a_whole_number_of_any_kind():
+    moved = [[np.ones((4, 3), np.float32), *(np.zeros((4, 3), np.float32) for _ in range(2))] for _ in range(2)]
+    for each, step in zip(moved, (3, np.int64(3)), strict=True):
+        assert ops.sparse_adam_(*each, np.ones((4, 3), np.float32), None, step, lr=0.1)
+    np.testing.assert_array_equal(*(each[0] for each in moved))
+
+
+def test_wrong_kinds_of_arguments_are_named():
+    three, camera, anchors = np.ones((9, 3), np.float32), camera_at(0.0, 0.0), some_anchors()
+    quats, decoder = np.ones((9, 4), np.float32), Decoder.init_random(3, False, 2, 4, torch.Generator())
+    for call, said in (
+        (lambda: ops.project(three.tolist(), quats, three, camera), "means must be torch.Tensor or numpy.ndarray, not"),
+        (lambda: ops.project(three, quats, None, camera), "scales must be torch.Tensor or numpy.ndarray, not NoneType"),
+        (lambda: ops.project(three, quats, three, np.eye(3)), "camera must be vdgs.Camera, not ndarray"),
+        (lambda: ops.cull(three, [1.0], camera), "log_scales must be torch.Tensor or numpy.ndarray, not list"),
+        (lambda: ops.cull(three, three, np.eye(3)), "camera must be vdgs.Camera"),
+        (lambda: ops.decode_anchors(three, decoder, camera), "anchors must be vdgs.Anchors, not ndarray"),
+        (lambda: ops.decode_anchors(anchors, three, camera), "decoder must be vdgs.Decoder"),
+        (lambda: ops.decode_anchors(anchors, decoder, camera, [1]), "rows must be torch.Tensor or numpy.ndarray"),
+        (lambda: ops.photometric_loss([1.0], three), "image must be torch.Tensor or numpy.ndarray, not list"),
+        (lambda: ops.photometric_loss(three, [1.0]), "target must be"),
+        (lambda: ops.photometric_loss(three, three, [1]), "mask must be"),
+        (lambda: ops.sparse_adam_([1.0], three, three, three, None, 1, lr=1.0), "parameter must be"),
+        (lambda: ops.sparse_adam_(three, three, three, [1.0], None, 1, lr=1.0), "gradient must be"),
+        (lambda: ops.sparse_adam_(three, three, three, three, [1], 1, lr=1.0), "rows must be"),
+        (lambda: ops.sparse_adam_(three, three, three, three, None, 1.5, lr=1.0), "step must be"),
+    ):
+        with pytest.raises(TypeError, match="^" + said):
+            call()
+    for wrong in (4, -1, "a", 1.5):
+        with pytest.raises(VdgsError, match=f"^image_index is '?{wrong}'?; it must be"):
+            ops.decode_anchors(anchors, decoder, camera, image_index=wrong)

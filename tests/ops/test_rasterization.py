@@ -11,7 +11,7 @@ import torch
 
 from support.fake_gsplat import needs_gsplat
 from vdgs import ops
-from vdgs.errors import UnsupportedOption
+from vdgs.errors import UnsupportedOption, VdgsError
 
 WIDTH, HEIGHT = 48, 32
 
@@ -294,6 +294,91 @@ def test_what_gsplat_has_and_this_has_not_is_said(option):
 def test_double_precision_is_refused():
     with pytest.raises(TypeError, match=r"convert it with \.float"):
         draw(scene(dtype=torch.float64))
+    with pytest.raises(TypeError, match=r"convert it with \.astype\(np\.float32\)"):
+        draw(scene() | {"means": np.zeros((60, 3), np.float16)})
+
+
+def test_what_is_no_tensor_is_named():
+    given = scene()
+    for name in ("means", "opacities", "colors", "viewmats", "Ks"):
+        with pytest.raises(TypeError, match=rf"^{name} must be torch.Tensor or numpy.ndarray, not NoneType"):
+            draw(given | {name: None})
+    with pytest.raises(TypeError, match=r"^viewmats must be torch.Tensor or numpy.ndarray, not list"):
+        draw(given | {"viewmats": given["viewmats"].tolist()})
+    with pytest.raises(TypeError, match=r"^means must hold numbers"):
+        draw(given | {"means": np.full((60, 3), None)})
+
+
+@pytest.mark.parametrize("name", ["width", "height", "tile_size", "sh_degree"])
+@pytest.mark.parametrize("value", ["44", 4.5, -1])
+def test_numbers_that_are_not_whole_are_named(name, value):
+    with pytest.raises(VdgsError, match=f"^{name} is '?{value}'?; it must be"):
+        ops.rasterization(**scene(), **({"width": WIDTH, "height": HEIGHT} | {name: value}))
+
+
+def test_sizes_may_be_whole_numbers_of_any_kind():
+    given = scene()
+    for width in (float(WIDTH), np.int64(WIDTH), torch.tensor(WIDTH)):
+        picture, _, meta = ops.rasterization(**given, width=width, height=HEIGHT)
+        assert torch.equal(picture, draw(given)[0])
+        assert type(meta["width"]) is int
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("mode", ["RGB", "ED", "RGB+D"])
+def test_nothing_is_drawn_as_nothing(packed, mode):
+    """A map before its first Gaussian, one whose Gaussians were all removed, no camera, no batch, no channel."""
+    given, options = scene(), {"packed": packed, "render_mode": mode}
+    channels = {"RGB": 3, "ED": 1, "RGB+D": 4}[mode]
+    empty = {name: each if name in ("viewmats", "Ks", "backgrounds") else each[:0] for name, each in given.items()}
+    moved = with_gradients(empty)
+    picture, alpha, meta = draw(moved, **options)
+    assert (picture.shape, alpha.shape) == ((2, HEIGHT, WIDTH, channels), (2, HEIGHT, WIDTH, 1))
+    assert not alpha.any()
+    if mode != "ED":
+        assert torch.equal(picture[..., :3], given["backgrounds"][:, None, None].expand(2, HEIGHT, WIDTH, 3))
+        picture.sum().backward()
+        assert moved["backgrounds"].grad.tolist() == [[WIDTH * HEIGHT] * 3] * 2
+        assert moved["means"].grad.shape == (0, 3)
+    assert meta["means2d"].shape == ((0, 2) if packed else (2, 0, 2))
+    views = {name: each[:0] if name in ("viewmats", "Ks", "backgrounds") else each for name, each in given.items()}
+    for of, shape, of_meta in (
+        (views, (0,), (0, 60, 3)),
+        ({name: each[None][:0] for name, each in given.items()}, (0, 2), (0, 2, 60, 3)),
+    ):
+        picture, alpha, meta = draw(of, **options)
+        assert picture.shape == (*shape, HEIGHT, WIDTH, channels)
+        assert alpha.shape == (*shape, HEIGHT, WIDTH, 1)
+        assert meta["conics"].shape == ((0, 3) if packed else of_meta)
+        assert meta["radii"].dtype == torch.int32
+    bare = given | {"colors": given["colors"][:, :0], "backgrounds": given["backgrounds"][:, :0]}
+    picture, alpha, _ = draw(bare, **options)
+    assert picture.shape == (2, HEIGHT, WIDTH, channels - 3 if mode != "ED" else 1)
+    assert torch.equal(alpha, draw(given, **options)[1])
+
+
+@pytest.mark.parametrize("options", [{}, {"rasterize_mode": "antialiased"}, {"eps2d": 0.1}, {"sh_degree": 1}])
+def test_autocast_changes_nothing(options):
+    given = scene()
+    if "sh_degree" in options:
+        given["colors"] = given["colors"][:, None].repeat(1, 4, 1)
+    results = []
+    for enabled in (False, True):
+        moved = with_gradients(given)
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            picture = draw(moved, **options)[0]
+        picture.square().sum().backward()
+        results.append([picture, *(each.grad for each in moved.values() if each.grad is not None)])
+    assert len(results[0]) == len(given)
+    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("mode", ["D", "ED"])
+def test_depths_have_no_background_whatever_is_given(mode):
+    given = scene()
+    wanted = draw(given | {"backgrounds": None}, render_mode=mode)[0]
+    for channels in (1, 3, 7):
+        assert torch.equal(draw(given | {"backgrounds": torch.ones(2, channels)}, render_mode=mode)[0], wanted)
 
 
 @needs_gsplat

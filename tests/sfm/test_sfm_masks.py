@@ -73,6 +73,8 @@ def left_half(height: int = 120, width: int = 160) -> np.ndarray:
         pytest.param("images", "images/{}.jpg", "masks/{}.jpg", id="images alone are named"),
         pytest.param(".", "100 MEDIA/é{}.jpg", "100 MEDIA/masks/e\u0301{}.png", id="in folders of a card"),
         pytest.param(".", "DCIM/100/{}.jpg", "Masks/DCIM/100/{}.png", id="in a tree of their own"),
+        pytest.param(".", "rgb/{}.jpg", "mask/{}.png", id="beside a folder of any name"),
+        pytest.param(".", "site/final/train/rgb/{}.jpg", "site/final/train/mask/{}.png", id="as NeRF-OSR has them"),
     ],
 )
 def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
@@ -91,6 +93,20 @@ def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
         plan_reconstruction(SfmRequest(image_folders=(tmp_path / asked,), output=tmp_path.parent / "new")), "", said
     )
     assert "3 of 4 photographs have one" in said.file.getvalue()
+
+
+def test_of_photographs_of_one_name_each_has_a_mask_of_its_own(tmp_path):
+    photographs(tmp_path, *(f"{name}/{k}.{kind}" for name, kind in (("rgb", "jpg"), ("nir", "tif")) for k in range(2)))
+    flat = write_mask(tmp_path / "masks/0.png", left_half())
+    with pytest.raises(CaptureError, match=r"\((nir|rgb)/0\.png; 0\.png is there\)"):
+        collect_images([tmp_path])
+    flat.unlink()
+    for folder in ("rgb", "nir"):
+        write_mask(tmp_path / "masks" / folder / "0.png", left_half())
+    masks = {photo.name: photo.mask for photo in collect_images([tmp_path]).images}
+    assert {name: mask and mask.parent.name for name, mask in masks.items()} == {
+        "rgb/0.jpg": "rgb", "nir/0.tif": "nir", "rgb/1.jpg": None, "nir/1.tif": None,
+    }  # fmt: skip
 
 
 def test_masks_of_nothing_and_of_other_shapes_are_named(tmp_path):

@@ -211,9 +211,11 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
         return likely[0], [f"no images/ folder; the photographs in {root / likely[0]} are used (--images chooses)."]
     above = next((folder for folder in root.resolve().parents[:2] if (folder / "images").is_dir()), None)
     if above is not None and not named:
-        raise CaptureError(
-            f"{root}: is a model alone; its photographs lie beside it. Give the folder of both: {shell_word(above)}"
-        )
+        models = {model.resolve() for model in find_models(above)}
+        both = any(model.resolve() in models for model in find_models(root))
+        give = f"Give the folder of both: {shell_word(above)}"
+        give = give if both else f"Say where: vdgs run {shell_word(root)} --images {shell_word(above / 'images')}"
+        raise CaptureError(f"{root}: is a model alone; its photographs lie beside it. {give}")
     named = named or ["FOLDER, wherever it is"]
     where = f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}"
     raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}.")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vdgs.captures.formats.source_capture import SourceView
 from vdgs.captures.image_files import find_images, find_mask, find_mask_beside, read_header, same_aspect
-from vdgs.captures.name_resolution import find_file
+from vdgs.captures.name_resolution import find_file, largest_shrunk
 from vdgs.captures.strays import MASK_FOLDERS
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -23,7 +23,8 @@ def find_masks(
     of them is of a photograph.
     """
     asked_for = options.masks != CaptureOptions.masks
-    names = () if asked_for else MASK_FOLDERS
+    shrunk = largest_shrunk(root, CaptureOptions.masks)  # as nerfstudio has them beside images_2, images_4, ...
+    names = () if asked_for else (*MASK_FOLDERS, *([shrunk] if shrunk else []))
     folder = next((root / name for name in names if (root / name).is_dir()), root / options.masks)
     if asked_for and not folder.is_dir() and Path(options.masks).is_dir():
         folder = Path(options.masks)  # given from where the person stands

@@ -14,8 +14,10 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf
 from vdgs.captures.image_files import readable_suffixes
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.project_formats import PROJECTS, find_projects
+from vdgs.captures.strays import is_mask_folder, why_not_read
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
+from vdgs.system.units import first_names
 
 #: So many folders deep a model is looked for: WORKSPACE/dense/0 with sparse in it, and one above.
 DEEPEST = 3
@@ -74,7 +76,12 @@ _BY_CONTENT = (
     (".xml", rb"<document version", f"an export of Metashape without poses; {_ALIGN}"),
     (".json", rb'"has_mono_prior"', "poses of SDFStudio; the transforms.json or COLMAP model of the same data is read"),
     # The phone writes the keys in any order, and the lists are long.
-    (".json", rb'"(initpose|perframeintrinsiccoeffs|frametimestamps)"|\A\s*{\s*"poses"\s*:\s*\[\s*\[', _RECORD3D),
+    (".json", rb'"(initpose|perframeintrinsiccoeffs|frametimestamps)"', _RECORD3D),
+    (".json", rb'\A\s*{\s*"poses"\s*:\s*\[\s*\[([^],]+,){6}[^],]+\]', _RECORD3D),
+    (
+        ".json", rb'\A\s*{\s*"poses"\s*:\s*\[\s*\[([^],]+,){16}[^],]+\]',
+        "poses of BungeeNeRF; the photographs are read without them: vdgs sfm images --output CAPTURE",
+    ),
     (".json", rb'"t_00"\s*:', _POLYCAM),
     (
         ".json", rb'"transform_matrix"',
@@ -125,7 +132,8 @@ def model_below(root: Path) -> str | None:
                 f"{shell_word(root)} --output RUN"
             )
         if _has_photographs(folder):
-            return f"{folder} is a capture: vdgs run {shell_word(folder)}{_images_beside(root, folder)} --output RUN"
+            command = f"vdgs run {shell_word(folder)}{_images_beside(root, folder)} --output RUN"
+            return f"{folder} is a capture: {command}{_other_captures(root, folder)}"
         alone = alone or (folder if find_models(folder) else None)
     if alone is None:
         return None
@@ -136,6 +144,15 @@ def model_below(root: Path) -> str | None:
         f"{biggest} is a COLMAP model of {count_images(biggest)} photographs. To use it, put them beside it as images: "
         f"{link}vdgs run {shell_word(alone)} --output RUN"
     )
+
+
+def _other_captures(root: Path, first: Path) -> str:
+    """What to say of captures beside one, as of val/ beside train/: a run is of one."""
+    others = [folder for folder in sorted(first.parent.iterdir()) if folder.is_dir() and folder != first]
+    names = [
+        folder.relative_to(root).as_posix() for folder in others if is_capture(folder) and _has_photographs(folder)
+    ]
+    return f" (without the photographs of {first_names(names)}, which a run of its own takes)" if names else ""
 
 
 def _images_beside(root: Path, capture: Path) -> str:
@@ -216,10 +233,21 @@ def _has_photographs(folder: Path) -> bool:
 
 
 def _photographs_beside(root: Path, model: Path) -> Path | None:
-    """The folder with most images in or right below `root`, but not in the model's own."""
-    folders = [root, *(entry for entry in root.iterdir() if entry.is_dir() and entry not in (model, *model.parents))]
-    counts = {
-        folder: sum(entry.suffix.lower() in readable_suffixes() for entry in folder.iterdir()) for folder in folders
-    }
-    best = max(counts, key=lambda folder: counts[folder])
-    return best if counts[best] else None
+    """The folder with most images beside a model or above it, up to `root`, the nearest first; one that has them in
+    folders of its own only where no other has any."""
+    above = [folder for folder in model.parents if folder == root or root in folder.parents]
+    for directly in (True, False):
+        for level in above:
+            beside = [entry for entry in sorted(level.iterdir()) if entry.is_dir() and entry not in (model, *above)]
+            beside = [entry for entry in beside if not is_mask_folder(entry.name) and why_not_read(entry) is None]
+            counts = {folder: _count_images(folder, directly) for folder in beside}
+            counts |= {level: _count_images(level, directly)} if directly else {}
+            best = max(counts, key=lambda folder: counts[folder], default=level)
+            if counts.get(best):
+                return best
+    return None
+
+
+def _count_images(folder: Path, directly: bool) -> int:
+    files = folder.iterdir() if directly else folder.rglob("*")
+    return sum(entry.suffix.lower() in readable_suffixes() for entry in files)

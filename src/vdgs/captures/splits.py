@@ -1,13 +1,14 @@
 """Which photographs train and which test.
 
 A capture may bring its own lists, `test.txt` and `validation.txt` beside its photographs' folder or beside its COLMAP
-model, where 3DGS reads them, one name a line. Photographs of either list never train; those of `validation.txt` are
-used with `--validation` only. Formats may say it too; where one says it of some photographs only, the others are left
-out, as nerfstudio does.
+model, where 3DGS reads them, one name a line; or the `train_test_lists.json` of ScanNet++ there. Photographs of either
+list never train; those of `validation.txt` are used with `--validation` only. Formats may say it too; where one says it
+of some photographs only, the others are left out, as nerfstudio does.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -24,6 +25,8 @@ from vdgs.errors import CaptureError
 
 #: Lists that a capture may bring.
 TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
+#: The list for the test by its names, the first that is there counts.
+_TEST_LISTS = (TEST_LIST, "train_test_lists.json")
 #: Splits that follow from positions and headings.
 _BY_FLIGHT = ("strips", "obliques")
 
@@ -83,7 +86,7 @@ def held_out_by_capture(
 ) -> dict[str, set[str]]:
     """The photographs that `--test-list` or a capture's own lists keep from training, by the names of the lists."""
     found, files = dict[str, set[str]](), {VALIDATION_LIST: _list_of(root, VALIDATION_LIST)}
-    files[TEST_LIST] = options.test_list or _list_of(root, TEST_LIST)
+    files[TEST_LIST] = options.test_list or _list_of(root, *_TEST_LISTS)
     for name, file in files.items():
         if file is not None and options.split not in ("every", *_BY_FLIGHT):
             found[name], notes = listed_photographs(file, names, some=name == TEST_LIST, strict=options.strict)
@@ -91,9 +94,9 @@ def held_out_by_capture(
     return found
 
 
-def _list_of(root: Path, name: str) -> Path | None:
-    """A list that a capture brings: in its folder, or beside its COLMAP model."""
-    files = (folder / name for folder in (root, *find_models(root)))
+def _list_of(root: Path, *names: str) -> Path | None:
+    """A list that a capture brings, by the first of its names: in its folder, or beside its COLMAP model."""
+    files = (folder / name for name in names for folder in (root, *find_models(root)))
     return next((file for file in files if file.is_file()), None)
 
 
@@ -102,7 +105,7 @@ def _splits(
 ) -> list[Split | None]:
     """The split of each view: by the list asked for, the capture's list, its format (None where that knows others
     only), or every n-th."""
-    listed = options.test_list or _list_of(root, TEST_LIST)
+    listed = options.test_list or _list_of(root, *_TEST_LISTS)
     if options.split in _BY_FLIGHT:
         return _splits_by_flight(root, views, options)
     if options.split != "every":
@@ -162,17 +165,30 @@ def _with_validation_list(views: list[View], listed: set[str], validation: bool)
 def listed_photographs(
     file: Path, names: Sequence[str], *, some: bool, strict: bool = False
 ) -> tuple[set[str], list[str]]:
-    """Those of `names` that a text file lists, one a line, and a warning about its lines that mean none of them. Raises
-    CaptureError for a list that cannot be read or names nothing where `some` are needed, and as `find_listed`."""
+    """Those of `names` that a text file lists, one a line, or a JSON file under `test`, and a warning about those that
+    mean none of them. Raises CaptureError for a list that cannot be read or names nothing where `some` are needed, and
+    as `find_listed`."""
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
+        text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise CaptureError(f"{file}: is not UTF-8 text ({error}). Save it as UTF-8.") from None
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from None
+    lines = _names_in_json(file, text) if file.suffix.lower() == ".json" else text.splitlines()
     wanted = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if some and not wanted:
         raise CaptureError(
             f"{file}: names no photograph. Write one image name a line, or ignore lists with --split every."
         )
     return find_listed(wanted, names, str(file), strict=strict)
+
+
+def _names_in_json(file: Path, text: str) -> list[str]:
+    """The list `test` of a JSON file. Raises CaptureError where there is none."""
+    try:
+        names = json.loads(text)["test"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        names = None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise CaptureError(f'{file}: must hold {{"test": [names of photographs]}}. Write that, or use --split every.')
+    return names

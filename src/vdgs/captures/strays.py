@@ -16,11 +16,13 @@ _HIDDEN = re.compile(
     r"|thumbs?_.*|proxies|cache|__pycache__",
     re.IGNORECASE,
 )
-#: Folders of what programs made of photographs: ODM, OpenSfM, COLMAP, Pix4D, Metashape, and their maps.
+#: Folders of what programs made of photographs: ODM, OpenSfM, COLMAP, Pix4D, Metashape, and their maps; and of what
+#: people say that photographs show (UAVid, UDD, FloodNet).
 _PRODUCTS = re.compile(
     r"odm_\w+|opensfm|entwine_pointcloud|3d_tiles|dsm|dtm|dem|chm|ndvi|ortho(photos?|mosaics?)|dsm_ortho|mosaics?"
     r"|1_initial|2_densification|3_dsm_ortho|4_index|.+\.files|.+\.rcproj|stereo|depth_?maps?|normal_maps?|depths?"
-    r"|normals?|contact_?sheets?|renders?|reports?|textures?|texturing|\d+_orthophoto|undistorted_depths|semantics?",
+    r"|normals?|contact_?sheets?|renders?|reports?|textures?|texturing|\d+_orthophoto|undistorted_depths"
+    r"|semantics?|labels?(_\w+)?|\w+-label-img|annotations?|gt|ground_?truth|seg(mentations?)?",
     re.IGNORECASE,
 )
 #: Files by which programs mark a folder of their results (ours: maps, renders, runs).

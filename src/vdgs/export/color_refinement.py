@@ -106,8 +106,9 @@ def rows_of_part(baked: BakedGaussians, number: int) -> range:
 def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     """What the baked Gaussians do not show of the model's picture."""
     wanted, numbers = baked.render_target(camera)
+    background = torch.tensor(baked.model.background, dtype=torch.float32)
     found = get_backend(torch.device("cpu")).splat_contributions(
-        _splats(baked.spool, numbers, camera), torch.tensor(baked.model.background), camera.width, camera.height, wanted
+        _splats(baked.spool, numbers, camera), background, camera.width, camera.height, wanted
     )
     shown = (found.pixels >= MIN_PIXELS).nonzero()[:, 0]
     pixels = found.pixels.index_select(0, shown)
@@ -145,7 +146,7 @@ def color_updates(
             directions = torch.nn.functional.normalize(means.index_select(0, here) - _camera_center(camera), dim=1)
             columns.append((here, directions, view.colors[low:high].float(), view.pixels[low:high].float()))
     if not columns:
-        return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3)
+        return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3, dtype=torch.float32)
     numbers, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
     order, counts = sort_segments(numbers, rows.start, len(rows))
     directions, colors, pixels = (column.index_select(0, order) for column in rest)

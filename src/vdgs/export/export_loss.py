@@ -105,7 +105,7 @@ def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
 
 @torch.no_grad()
 def _render_gaussians(gaussians: Gaussians, run: OpenedRun, camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    background: Float[Tensor, "3"] = torch.tensor(run.model.background)
+    background: Float[Tensor, "3"] = torch.tensor(run.model.background, dtype=torch.float32)
     seen = gaussians.select(visible_gaussian_rows(gaussians, camera))
     raster, _ = render_gaussians(seen, camera, background, seen.sh_degree)
     pixels: np.ndarray = raster.image.numpy()

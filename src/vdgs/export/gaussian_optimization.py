@@ -66,7 +66,8 @@ def _step(
     seen = gaussians.select(rows)
     moved = [seen.tensors()[name].requires_grad_() for name in states]
     with torch.enable_grad():
-        raster, _ = render_gaussians(seen, camera, torch.tensor(baked.model.background), gaussians.sh_degree)
+        background = torch.tensor(baked.model.background, dtype=torch.float32)
+        raster, _ = render_gaussians(seen, camera, background, gaussians.sh_degree)
         gradients = torch.autograd.grad((raster.image - wanted).square().sum(), moved, materialize_grads=True)
     updates[rows] += 1
     for state, gradient in zip(states.values(), gradients, strict=True):

@@ -73,10 +73,10 @@ def with_learnt_blur(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 def empty_gaussians(degree: int) -> Gaussians:
     """None, with room for colors of a degree."""
-    wide = torch.zeros(0, 3)
+    wide = torch.zeros(0, 3, dtype=torch.float32)
     return Gaussians(
-        means=wide, log_scales=wide, quaternions=torch.zeros(0, 4), opacity_logits=torch.zeros(0), sh0=wide,
-        shN=torch.zeros(0, (degree + 1) ** 2 - 1, 3),
+        means=wide, log_scales=wide, quaternions=wide.new_zeros(0, 4), opacity_logits=wide.new_zeros(0), sh0=wide,
+        shN=wide.new_zeros(0, (degree + 1) ** 2 - 1, 3),
     )  # fmt: skip
 
 

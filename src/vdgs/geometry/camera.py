@@ -6,14 +6,16 @@ Conventions (docs/conventions.md): OpenCV axes (+x right, +y down, +z forward), 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Integral, Real
 from typing import Literal, cast
 
 import numpy as np
 
-from vdgs.errors import check_kind
+from vdgs.errors import VdgsError, check_kind
 
 CameraModel = Literal["pinhole", "orthographic"]
 
@@ -137,8 +139,23 @@ def is_rigid_motion(matrix: np.ndarray) -> bool:
 
 
 def check_cameras(cameras: object) -> None:
-    """Raise TypeError unless it is a sequence of cameras."""
+    """Raise what `check_camera` raises unless it is a sequence of cameras."""
     remedy = "of a capture take [view.camera for view in capture.train_views]"
     check_kind("cameras", cameras, Sequence, remedy=remedy)
     for camera in cast("Sequence[object]", cameras):
-        check_kind("each of cameras", camera, Camera, remedy=remedy)
+        check_camera("each of cameras", camera, remedy)
+
+
+def check_camera(name: str, camera: object, remedy: str = "") -> None:
+    """Raise TypeError for what is no camera, VdgsError for one that nothing can be drawn with: `Camera` itself checks
+    nothing, as thousands are made."""
+    check_kind(name, camera, Camera, remedy=remedy)
+    camera = cast("Camera", camera)
+    pose, sides = camera.camera_from_world, (camera.width, camera.height)
+    if not (isinstance(pose, np.ndarray) and pose.shape == (4, 4) and is_rigid_motion(pose)):
+        raise VdgsError(f"{name}: camera_from_world must be a rotation and a translation, [4, 4] of numpy, not {pose}")
+    if not all(isinstance(side, Integral) and side >= 1 for side in sides):
+        raise VdgsError(f"{name}: width and height must be whole numbers of pixels, at least 1, not {sides}")
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+    if not (all(isinstance(each, Real) and math.isfinite(each) for each in lens) and min(lens[:2]) > 0):
+        raise VdgsError(f"{name}: fx and fy must be above 0, and cx and cy finite numbers, not {lens}")

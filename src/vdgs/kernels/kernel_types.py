@@ -85,7 +85,8 @@ class DecoderWeights:
             inputs = FEATURE_SIZE + 3 + int(with_distance)
             layers = ((HIDDEN_SIZE, inputs), (outputs, HIDDEN_SIZE))
             shapes = [(shape, columns**-0.5) for rows, columns in layers for shape in ((rows, columns), (rows,))]
-            return MlpWeights(*((2 * torch.rand(shape, generator=generator) - 1) * bound for shape, bound in shapes))
+            drawn = ((torch.rand(shape, generator=generator, dtype=torch.float32), bound) for shape, bound in shapes)
+            return MlpWeights(*((2 * each - 1) * bound for each, bound in drawn))
 
         return DecoderWeights(head(k), head(7 * k), head(3 * k))
 
@@ -288,7 +289,8 @@ class DensificationStats:
     @staticmethod
     def zeros(n: int, k: int, device: torch.device | None = None) -> DensificationStats:
         """Those of anchors that no view has shown yet."""
-        return DensificationStats(*(torch.zeros(shape, device=device) for shape in ((n, k), (n, k), (n,), (n,))))
+        shapes = (n, k), (n, k), (n,), (n,)
+        return DensificationStats(*(torch.zeros(shape, dtype=torch.float32, device=device) for shape in shapes))
 
     def tensors(self) -> dict[str, Tensor]:
         """The four by name."""

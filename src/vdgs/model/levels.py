@@ -73,7 +73,7 @@ def add_coarser_levels(anchors: Anchors, voxel: float, max_pixels: Sequence[floa
         # Halves are rounded up, as those of cells in which anchors grow.
         cells, member = np.unique(np.floor(voxels / 2.0**level + 0.5), axis=0, return_inverse=True)
         index, places = torch.from_numpy(member.reshape(-1)), torch.from_numpy((cells * cell).astype(np.float32))
-        features = torch.zeros(len(places), anchors.features.shape[1]).index_add_(0, index, anchors.features)
+        features = places.new_zeros(len(places), anchors.features.shape[1]).index_add_(0, index, anchors.features)
         features /= torch.bincount(index, minlength=len(places))[:, None]
         log_scales = torch.from_numpy(mean_spacing(cells * cell, cell).astype(np.float32)).log()[:, None].repeat(1, 6)
         offsets = anchors.offsets.new_zeros(len(places), *anchors.offsets.shape[1:])

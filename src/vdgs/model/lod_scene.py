@@ -113,7 +113,8 @@ class LodScene:
             places = torch.arange(first, first + len(splats.depths) - len(rows), device=self.device)
             rows = torch.cat([rows, places])
         if splats is None:
-            empty, wide = torch.zeros(0, device=self.device), torch.zeros(0, 3, device=self.device)
+            empty = torch.zeros(0, dtype=torch.float32, device=self.device)
+            wide = empty.new_zeros(0, 3)
             splats = Splats(empty.new_zeros(0, 2), wide, empty, wide, empty)
         return rows, splats
 
@@ -125,7 +126,7 @@ class LodScene:
             found.append(self._leaf_values(cut.leaves, camera, of))
         if cut.nodes:
             found += [self._node_values(node, of) for node in cut.nodes if not _are_zero(self._node_factors(node))]
-        return torch.cat(found) if found else torch.zeros(0)
+        return torch.cat(found) if found else torch.zeros(0, dtype=torch.float32)
 
     def _node_values(self, node: int, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
         """Values of the merged Gaussians of a node."""
@@ -231,7 +232,7 @@ def _held(
 def model_of_rows(model: AnchorModel, anchors: Anchors, rows: Int[Tensor, " r"]) -> AnchorModel:
     """The anchors of some rows of a model, ascending, each with its decoder there."""
     spans = model.decoder_spans
-    ends = torch.tensor([0, *(span.count for span in spans)]).cumsum(0)
+    ends = torch.tensor([0, *(span.count for span in spans)], dtype=torch.int64).cumsum(0)
     bounds = torch.searchsorted(rows.long(), ends).tolist()
     parts = (replace(span, count=last - first) for span, first, last in zip(spans, bounds, bounds[1:], strict=False))
     return replace(model, anchors=anchors, decoder_spans=tuple(parts))

@@ -29,10 +29,10 @@ from vdgs.config.type_hints import field_hints
 from vdgs.config.validation_rules import checked_settings, checked_value
 from vdgs.errors import CaptureError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
-from vdgs.geometry.camera import check_cameras
+from vdgs.geometry.camera import check_camera, check_cameras
 from vdgs.kernels.device_selection import select_device
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.ops.arrays import Array, as_tensor, like
+from vdgs.ops.arrays import Array, as_tensor, check_image_index, like
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
 from vdgs.runs import open_run as runs
@@ -40,6 +40,8 @@ from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
+
+_COLOR = Annotated[tuple[float, float, float], Range(0, 1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,25 +182,34 @@ def render(
     camera: Camera,
     *,
     mode: Literal["rgb", "rgb+depth"] = "rgb",
-    background: tuple[float, float, float] | None = None,
+    background: Sequence[float] | np.ndarray | Tensor | None = None,
     image_index: int | None = None,
 ) -> Render:
     """Draw one view of a scene, without gradients.
 
-    `background` replaces the scene's own, its environment map too; `image_index` selects the appearance of a training
-    photograph, where one was trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
+    `background`, three numbers from 0 to 1, replaces the scene's own, its environment map too; `image_index` selects
+    the appearance of a training photograph, where one was trained. Source: Scaffold-GS eqs. 3-8, 3DGS eqs. 2-3.
     """
     from vdgs.model.renderer import render as draw
 
     _check_scene(scene)
-    check_kind("camera", camera, Camera)
+    check_camera("camera", camera)
     if mode not in ("rgb", "rgb+depth"):
         raise VdgsError(f"mode={mode!r}: choose rgb or rgb+depth")
-    raster = draw(scene.model, camera, background=background, depth=mode != "rgb", image_index=image_index)
+    color = None if background is None else _checked_color("background", background)
+    index = check_image_index(image_index, (decoder for _, _, decoder in scene.model.decoder_ranges()))
+    raster = draw(scene.model, camera, background=color, depth=mode != "rgb", image_index=index)
     if raster.depth is None or raster.median_depth is None:
         return Render(raster.image, raster.alpha, None, None)
     median = raster.median_depth.masked_fill(raster.median_depth == 0, torch.nan)
     return Render(raster.image, raster.alpha, median, raster.depth / raster.alpha)
+
+
+def _checked_color(name: str, value: Any) -> tuple[float, float, float]:
+    """A color that a caller gave as numbers, an array or a tensor."""
+    numbers = value.tolist() if isinstance(value, (np.ndarray, Tensor)) else value
+    color: tuple[float, float, float] = checked_value(name, numbers, _COLOR)
+    return color
 
 
 def count_visibility(points: Array, cameras: Sequence[Camera]) -> Array:
@@ -308,7 +319,7 @@ def merge(
     """One scene from trained blocks: every place takes its anchors from exactly one block.
 
     `scene` is the coarse scene that the blocks were trained from; the rows of `assignment` are its training cameras.
-    Raises VdgsError for blocks of another coarse scene, ValueError where the numbers do not fit.
+    Raises VdgsError for blocks of another coarse scene or in another order, ValueError where the numbers do not fit.
     """
     from vdgs.partition.merging import merge_blocks
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from vdgs.config.ranges import MAX_COUNT, Range
 from vdgs.config.validation_rules import checked_value
 from vdgs.errors import VdgsError, check_kind
 from vdgs.geometry.camera import Camera, CameraModel, is_rigid_motion
+from vdgs.model.decoder import Decoder
 
 #: What is no skew but rounding, in pixels.
 MAX_SKEW_PX = 1e-6
@@ -19,22 +21,44 @@ MAX_SKEW_PX = 1e-6
 Array = TypeVar("Array", Tensor, np.ndarray)
 
 
-def in_place(value: Any) -> Tensor:
-    """A tensor, or an array as one that shares its memory."""
-    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+def in_place(name: str, value: Any) -> Tensor:
+    """A tensor, or an array as one that shares its memory. Raises TypeError for anything else, ValueError for an array
+    that cannot be written to."""
+    check_kind(name, value, Tensor, np.ndarray)
+    if isinstance(value, Tensor):
+        return value
+    if not value.flags.writeable:
+        raise ValueError(
+            f"{name} is changed in place, and the array is read-only: give a copy, np.array({name}), or open a file "
+            "with mmap_mode='r+'"
+        )
+    if not value.dtype.isnative:
+        raise TypeError(f"{name} is changed in place, and its bytes are swapped: give {name}.astype(np.float32)")
+    return torch.from_numpy(value)
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
     """A tensor, or a copy of an array as one, in the precision that it came in. Raises TypeError for anything else."""
     check_kind(name, value, Tensor, np.ndarray)
-    return torch.from_numpy(np.array(value)) if isinstance(value, np.ndarray) else value
+    if isinstance(value, Tensor):
+        return value
+    if value.dtype.kind not in "biuf":
+        raise TypeError(f"{name} must hold numbers, not {value.dtype}")
+    return torch.from_numpy(np.array(value, value.dtype.newbyteorder("=")))
 
 
-def to_torch(value: Any) -> Tensor:
-    """A tensor, or an array as one: float64 arrays become float32, as numpy makes float64 unasked."""
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(np.array(value, np.float32 if value.dtype == np.float64 else value.dtype))
-    return value
+def to_torch(name: str, value: Any) -> Tensor:
+    """As `as_tensor`; arrays of float64 become float32, as numpy makes float64 unasked."""
+    tensor = as_tensor(name, value)
+    return tensor.float() if isinstance(value, np.ndarray) and tensor.dtype == torch.float64 else tensor
+
+
+def check_image_index(image_index: Any, decoders: Iterable[Decoder]) -> int | None:
+    """The number of a training photograph. Raises VdgsError for what is none of those that a decoder knows."""
+    if image_index is None:
+        return None
+    known = [len(each.appearance_embedding) for each in decoders if each.appearance_embedding is not None]
+    return int(checked_value("image_index", image_index, Annotated[int, Range(0, min(known, default=MAX_COUNT) - 1)]))
 
 
 def like(given: Any, value: Any) -> Any:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from vdgs.config.ranges import MAX_COUNT, Range
+from vdgs.config.validation_rules import checked_value
 from vdgs.errors import UnsupportedOption
 from vdgs.geometry.camera import NEAR_PLANE, Camera
 from vdgs.kernels import KERNELS_ENV_VAR, get_backend
@@ -96,29 +99,62 @@ def rasterization(
     gradients. `tile_size`, `channel_chunk` and `segmented` change nothing: those of the kernels are their own.
 
     One difference: J is clamped at 1.3 half-angles on either side of the axis (3DGS), in gsplat of the image's center,
-    which tells on Gaussians beside the image where the principal point is not its center.
+    which tells where the principal point is not its center: on Gaussians beside the image, and beyond 15 % of the
+    image's side off its center, as in crops, also within it.
 
-    Raises ValueError for shapes that do not fit, TypeError for tensors other than float32, UnsupportedOption for
-    absgrad, sparse_grad, distributed, fisheye and ftheta cameras, distortion, rolling shutter, `with_ut` and
-    `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye et al. 2025 for the interface.
+    Raises ValueError for shapes that do not fit, TypeError for what is no tensor or array of float32, VdgsError for a
+    size or a degree that is no whole number, UnsupportedOption for absgrad, sparse_grad, distributed, fisheye and
+    ftheta cameras, distortion, rolling shutter, `with_ut` and `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye
+    et al. 2025 for the interface.
     """
     given = locals()
     _refuse_unsupported(given)
-    tensors = {name: to_torch(given[name]) for name in _Gaussians.names() if given[name] is not None}
-    gaussians: _Gaussians = _check_gaussians(sh_degree, tensors)
+    width, height, tile_size = (
+        checked_value(name, given[name], Annotated[int, Range(1, MAX_COUNT)])
+        for name in ("width", "height", "tile_size")
+    )
+    if sh_degree is not None:
+        sh_degree = checked_value("sh_degree", sh_degree, Annotated[int, Range(0, MAX_COUNT)])
+    gaussians: _Gaussians = _check_gaussians(sh_degree, _tensors(given))
     settings = _Settings(
-        width=int(width), height=int(height), near=near_plane, far=far_plane, radius_clip=radius_clip, eps2d=eps2d,
+        width=width, height=height, near=near_plane, far=far_plane, radius_clip=radius_clip, eps2d=eps2d,
         antialiased=rasterize_mode == "antialiased", orthographic=camera_model == "ortho",
     )  # fmt: skip
-    meta, images = _projected(gaussians, settings, packed)
-    drawn = [_draw_image(gaussians, settings, image, render_mode, sh_degree) for image in images]
+    with torch.autocast(gaussians.means.device.type, enabled=False):  # the kernels compute in float32
+        meta, images = _projected(gaussians, settings, packed)
+        drawn = [_draw_image(gaussians, settings, image, render_mode, sh_degree) for image in images]
     meta |= {
         "tile_width": -(-width // tile_size), "tile_height": -(-height // tile_size), "width": width, "height": height,
         "tile_size": tile_size, "n_batches": gaussians.num_batches, "n_cameras": gaussians.num_cameras,
     }  # fmt: skip
-    shape = (*gaussians.batch, gaussians.num_cameras, height, width, -1)
-    picture, alpha = (torch.stack(each).reshape(shape) for each in zip(*drawn, strict=True))
+    channels = (0 if render_mode in ("D", "ED") else gaussians.colors.shape[-1]) + (render_mode != "RGB")
+    shape = (*gaussians.batch, gaussians.num_cameras, height, width)
+    picture, alpha = _joined(drawn, gaussians.means.new_zeros(0, height, width, channels))
+    picture, alpha = picture.reshape(*shape, channels), alpha.reshape(*shape, 1)
     return like(means, (picture, alpha, meta))
+
+
+def _joined(drawn: Sequence[tuple[Tensor, Tensor]], none: Tensor) -> tuple[Tensor, Tensor]:
+    """The pictures [n, h, w, x] and alphas [n, h, w] of the images; where there are none, those of `none`."""
+    if not drawn:
+        return none, none.sum(-1)
+    pictures, alphas = zip(*drawn, strict=True)
+    return torch.stack(pictures), torch.stack(alphas)
+
+
+def _tensors(given: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The arguments that are tensors, by name. Raises TypeError for those of another kind or dtype."""
+    optional = ("quats", "scales", "covars", "backgrounds")
+    names = [name for name in _Gaussians.names() if name not in optional or given[name] is not None]
+    if given["render_mode"] in ("D", "ED"):  # as in gsplat, behind depths there is nothing
+        names = [name for name in names if name != "backgrounds"]
+    tensors = {name: to_torch(name, given[name]) for name in names}
+    allowed = [torch.float32] + [torch.float64] * (os.environ.get(KERNELS_ENV_VAR) == "torch_ref")
+    for name, tensor in tensors.items():
+        if tensor.dtype not in allowed or tensor.dtype != tensors["means"].dtype:
+            remedy = ".float()" if isinstance(given[name], Tensor) else ".astype(np.float32)"
+            raise TypeError(f"{name} must be float32, not {tensor.dtype}: convert it with {remedy}")
+    return tensors
 
 
 def _refuse_unsupported(given: Mapping[str, Any]) -> None:
@@ -177,10 +213,6 @@ class _Gaussians:
 def _check_gaussians(sh_degree: int | None, tensors: dict[str, Tensor]) -> _Gaussians:
     """From tensors with any batch dimensions. Raises what `rasterization` raises."""
     means, colors = tensors["means"], tensors["colors"]
-    allowed = [torch.float32] + [torch.float64] * (os.environ.get(KERNELS_ENV_VAR) == "torch_ref")
-    for name, tensor in tensors.items():
-        if tensor.dtype not in allowed or tensor.dtype != means.dtype:
-            raise TypeError(f"{name} must be float32, not {tensor.dtype}: convert it with .float()")
     if means.ndim < 2 or tensors["viewmats"].ndim < 3:
         given = f"{list(means.shape)} and {list(tensors['viewmats'].shape)}"
         raise ValueError(f"means must be [..., N, 3] and viewmats [..., C, 4, 4], not {given}")
@@ -207,7 +239,7 @@ def _check_gaussians(sh_degree: int | None, tensors: dict[str, Tensor]) -> _Gaus
         raise ValueError(f"sh_degree={sh_degree} needs {num_sh_bases(sh_degree)} bases, not {colors.shape[-2]}")
     if bool((tensors["Ks"][..., 0, 1] != 0).any()):
         raise UnsupportedOption("Ks: a camera has skew, which vdgs.ops.rasterization has not")
-    flat = {name: tensor.reshape(-1, *tensor.shape[len(batch) :]) for name, tensor in tensors.items()}
+    flat = {name: tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :]) for name, tensor in tensors.items()}
     return _Gaussians(batch=batch, **(flat | {"colors": flat["colors"] if own else flat["colors"][:, None]}))
 
 
@@ -228,22 +260,26 @@ def _projected(gaussians: _Gaussians, settings: _Settings, packed: bool) -> tupl
     places = [(b, c) for b in range(gaussians.num_batches) for c in range(gaussians.num_cameras)]
     views = [_project_image(gaussians, settings, b, c) for b, c in places]
     rows = [(radii > 0).all(-1).nonzero()[:, 0] for radii, *_ in views]
-    names = ("radii", "means2d", "depths", "conics", "opacities")
-    columns = zip(*views, strict=True)
+    means = gaussians.means
+    none = {  # to begin with, where there are no images
+        "radii": means.new_zeros(0, 2, dtype=torch.int32), "means2d": means.new_zeros(0, 2),
+        "depths": means.new_zeros(0), "conics": means.new_zeros(0, 3), "opacities": means.new_zeros(0),
+    }  # fmt: skip
+    columns = [[view[place] for view in views] for place in range(len(none))]
     meta: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
     if packed:
-        counts = torch.tensor([len(each) for each in rows], device=gaussians.means.device)
+        counts = torch.tensor([len(each) for each in rows], dtype=torch.int64, device=means.device)
         for name, at in (("batch_ids", 0), ("camera_ids", 1)):
-            meta[name] = torch.tensor([place[at] for place in places], device=counts.device).repeat_interleave(counts)
-        meta["gaussian_ids"] = torch.cat(rows)
-        for name, column in zip(names, columns, strict=True):
-            meta[name] = torch.cat([each[chosen] for each, chosen in zip(column, rows, strict=True)])
-        parts = [meta[name].split(counts.tolist()) for name in names]
+            meta[name] = counts.new_tensor([place[at] for place in places]).repeat_interleave(counts)
+        meta["gaussian_ids"] = torch.cat([counts[:0], *rows])
+        for (name, first), column in zip(none.items(), columns, strict=True):
+            meta[name] = torch.cat([first, *(each[chosen] for each, chosen in zip(column, rows, strict=True))])
+        parts = [meta[name].split(counts.tolist())[: len(rows)] for name in none]
     else:
-        shape, n = (*gaussians.batch, gaussians.num_cameras), gaussians.means.shape[1]
-        for name, column in zip(names, columns, strict=True):
-            meta[name] = torch.stack(column).reshape(*shape, n, *column[0].shape[1:])
-        flat = [meta[name].reshape(len(places), n, *meta[name].shape[len(shape) + 1 :]) for name in names]
+        shape, n = (*gaussians.batch, gaussians.num_cameras), means.shape[1]
+        for (name, first), column in zip(none.items(), columns, strict=True):
+            meta[name] = torch.cat([first, *column]).reshape(*shape, n, *first.shape[1:])
+        flat = [meta[name].reshape(len(places), n, *none[name].shape[1:]) for name in none]
         parts = [[each[i][chosen] for i, chosen in enumerate(rows)] for each in flat]
     images = [
         _Image(place[0], place[1], chosen, means2d, conics, depths, opacities)
@@ -297,7 +333,7 @@ def _radii(projected: ProjectedGaussians, opacities: Tensor, settings: _Settings
     extent = (2 * (opacities / ALPHA_MIN).clamp(min=1).log()).sqrt().clamp(max=MAX_EXTENT)
     radii = (extent[:, None] * variances.sqrt()).ceil().nan_to_num()
     low, high = projected.means_px + radii, projected.means_px - radii
-    size = torch.tensor([settings.width, settings.height], device=radii.device)
+    size = radii.new_tensor([settings.width, settings.height])
     shown = projected.valid & (opacities >= ALPHA_MIN) & (radii > settings.radius_clip).any(-1)
     shown &= (low > 0).all(-1) & (high < size).all(-1)
     shown &= (projected.depths > settings.near) & (projected.depths < settings.far)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Generic, NamedTuple
 
 from torch import Tensor
 
-from vdgs.geometry.camera import Camera
+from vdgs.errors import check_kind
+from vdgs.geometry.camera import Camera, check_camera
 from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import AdamState, AnchorSplats, IsFinite, PhotometricLoss
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import cull_anchors
 from vdgs.model.renderer import decode_anchors as decode_rows
-from vdgs.ops.arrays import Array, in_place, like, to_torch
+from vdgs.ops.arrays import Array, check_image_index, in_place, like, to_torch
 
 
 def cull(positions: Array, log_scales: Array, camera: Camera) -> Array:
@@ -22,8 +24,9 @@ def cull(positions: Array, log_scales: Array, camera: Camera) -> Array:
     positions [n, 3] in world units, log_scales [n, 6] (of the offsets' unit and of the Gaussians), float32. Raises
     ValueError for other shapes. Source: Scaffold-GS, section 3.2; the test is `kernels.torch_ref.cull`.
     """
-    at = to_torch(positions)
-    return like(positions, get_backend(at.device).cull(at, to_torch(log_scales), camera))
+    check_camera("camera", camera)
+    at = to_torch("positions", positions)
+    return like(positions, get_backend(at.device).cull(at, to_torch("log_scales", log_scales), camera))
 
 
 def decode_anchors(
@@ -35,8 +38,12 @@ def decode_anchors(
     (None: the mean). Differentiable in the anchors' tensors but positions, and in the decoder's. Source: Scaffold-GS
     eqs. 3-8.
     """
-    rows = cull_anchors(anchors, camera) if rows is None else rows
-    return decode_rows(anchors, rows, decoder.weights_for_image(image_index), camera)
+    check_kind("anchors", anchors, Anchors)
+    check_kind("decoder", decoder, Decoder)
+    check_camera("camera", camera)
+    rows = cull_anchors(anchors, camera) if rows is None else to_torch("rows", rows)
+    weights = decoder.weights_for_image(check_image_index(image_index, [decoder]))
+    return decode_rows(anchors, rows, weights, camera)
 
 
 class Projection(NamedTuple, Generic[Array]):
@@ -55,8 +62,9 @@ def project(means: Array, quats: Array, scales: Array, camera: Camera) -> Projec
     means [m, 3], quats [m, 4] (wxyz, any length), scales [m, 3], float32; differentiable in all three. Raises
     ValueError for other shapes. Source: 3DGS eq. 5 (EWA).
     """
-    at = to_torch(means)
-    found = get_backend(at.device).project(at, to_torch(scales), to_torch(quats), camera)
+    check_camera("camera", camera)
+    at = to_torch("means", means)
+    found = get_backend(at.device).project(at, to_torch("scales", scales), to_torch("quats", quats), camera)
     return like(means, Projection(found.means_px, found.conics, found.depths, found.valid))
 
 
@@ -68,9 +76,9 @@ def photometric_loss(
     Pixels where `mask` [h, w] uint8 is 0 do not count. Only `loss` carries a gradient, by the image, computed with it.
     Raises TypeError for other dtypes, ValueError for other shapes. Source: 3DGS eq. 7; Wang et al. 2004.
     """
-    given, counted = to_torch(image), None if mask is None else to_torch(mask)
-    kernels = get_backend(given.device)
-    return like(image, kernels.photometric_loss(given, to_torch(target), counted, ssim_weight=ssim_weight))
+    given, counted = to_torch("image", image), None if mask is None else to_torch("mask", mask)
+    kernels, wanted = get_backend(given.device), to_torch("target", target)
+    return like(image, kernels.photometric_loss(given, wanted, counted, ssim_weight=ssim_weight))
 
 
 def sparse_adam_(
@@ -86,14 +94,15 @@ def sparse_adam_(
     eps: float = 1e-15,
 ) -> IsFinite:
     """One step of Adam in place on the given rows [v] int64 (ascending; None: all) of a parameter [n, ...] and its
-    moments, all float32 and contiguous; the others keep their values.
+    moments, all float32, contiguous and writable; the others keep their values.
 
     `gradient` [v, ...] has a row for each of `rows`; `step` counts from 1, for all or [v] int32. Returns whether all
     gradients were finite; if not, nothing changed. Raises TypeError or ValueError before any change. Source: Kingma and
     Ba 2015, algorithm 1; rows as in Taming-3DGS.
     """
-    state = AdamState(in_place(parameter), in_place(first), in_place(second), lr)
-    chosen = None if rows is None else to_torch(rows)
-    number = step if isinstance(step, int) else to_torch(step)
-    kernels = get_backend(state.parameter.device)
-    return kernels.adam_rows(state, chosen, to_torch(gradient), number, beta1=betas[0], beta2=betas[1], epsilon=eps)
+    moments = in_place("first", first), in_place("second", second)
+    state = AdamState(in_place("parameter", parameter), *moments, lr)
+    chosen = None if rows is None else to_torch("rows", rows)
+    number = int(step) if isinstance(step, Integral) else to_torch("step", step)
+    kernels, along = get_backend(state.parameter.device), to_torch("gradient", gradient)
+    return kernels.adam_rows(state, chosen, along, number, beta1=betas[0], beta2=betas[1], epsilon=eps)

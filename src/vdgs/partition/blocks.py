@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
@@ -18,12 +18,15 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vdgs.errors import RunError
+from vdgs.errors import RunError, check_kind
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition.polygon_lookup import BlockCores
 from vdgs.system.atomic_files import write_json
 from vdgs.system.documents import JsonObject
+
+#: Tensors or arrays: what goes in comes out.
+Places = TypeVar("Places", Tensor, np.ndarray)
 
 
 def xy_positions(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -48,11 +51,17 @@ class Blocks:
     def __len__(self) -> int:
         return len(self.items)
 
-    def owner(self, points: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
-        """The block of every point: whose core holds it, else whose core is nearest (the first of equals).
+    def owner(self, points: Places) -> Places:
+        """The block [n] int64 of every point [n, 2]: whose core holds it, else whose core is nearest (the first of
+        equals).
 
-        Raises ValueError if a point is not finite.
+        Raises ValueError for other shapes and if a point is not finite, TypeError for what is no array or tensor.
         """
+        check_kind("points", points, np.ndarray, Tensor)
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise ValueError(f"points must be [n, 2], x and y, not {list(points.shape)}")
+        if isinstance(points, Tensor):
+            return torch.from_numpy(self.owner(points.detach().double().cpu().numpy())).to(points.device)
         return self._cores.nearest(points)
 
     @cached_property

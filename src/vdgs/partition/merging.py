@@ -43,8 +43,8 @@ def merge_blocks(
     it: then one block at a time is in memory. Memory: coarse and merged anchors, and half of the merged ones again.
     Blocks that trained one decoder together share it.
 
-    Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
-    `coarse`: by its grid, or by other bits of a frozen decoder.
+    Raises VdgsError for a missing block (unless allowed), for a model that says that it is of another block, and for
+    one that shows that it was not trained from `coarse`: by its grid, or by other bits of a frozen decoder.
     """
     if not len(block_models) == len(cameras_of_block) == len(blocks):
         raise ValueError(
@@ -62,7 +62,7 @@ def merge_blocks(
             anchors = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
             trained, kept = 0, 0
         else:
-            _check_coarse_model(index, model, coarse)
+            _check_block_model(index, model, coarse)
             sources = block_of_points(model.anchors.positions, blocks, cameras_of_block, config, missing)
             anchors = model.anchors.select(torch.from_numpy(sources == index))
             trained, kept = len(model.anchors), len(anchors)
@@ -132,8 +132,12 @@ def _concatenate(parts: Sequence[dict[str, Tensor]]) -> Anchors:
     return Anchors(**{name: torch.cat([part.pop(name) for part in parts]) for name in list(parts[0])})
 
 
-def _check_coarse_model(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
-    """Where blocks leave the decoder as it is, other bits are another coarse model."""
+def _check_block_model(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
+    """Where blocks leave the decoder as it is, other bits are another coarse model. A model may say its block."""
+    if model.metadata.block not in (None, index):
+        raise VdgsError(
+            f"the model at place {index} is of block {model.metadata.block}: give the models in the order of the blocks"
+        )
     same_decoder = has_own_decoder(model) or _decoder_bytes(model.decoder) == _decoder_bytes(coarse.decoder)
     same_offsets = model.anchors.offsets.shape[1] == coarse.anchors.offsets.shape[1]
     if not (same_decoder and same_offsets and model.voxel_size == coarse.voxel_size):

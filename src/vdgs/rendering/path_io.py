@@ -61,9 +61,8 @@ _NERFSTUDIO_KEYS = (
     "camera_path", "camera_type", "render_width", "render_height", "fps", "seconds", "frame", "crop", "closed",
     "keyframes", "smoothness_value", "is_cycle", "default_fov", "default_transition_sec",
 )  # fmt: skip
+#: `aspect` is not read, as nerfstudio does not: its Blender add-on writes 1 for films of any shape.
 _NERFSTUDIO_FRAME_KEYS = ("camera_to_world", "fov", "aspect", "render_time")
-#: How far the aspect of a frame may be from the film's: nerfstudio rounds it.
-_SAME_ASPECT = 0.02
 #: Focal lengths and principal points, in pixels.
 _FOCAL, _PIXELS = Range(0, 1e7, exclusive_min=True), Range(-1e7, 1e7)
 _SIDE = Range(1, commands.MAX_RENDER_SIDE_PX)
@@ -211,7 +210,7 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[
             _require(isinstance(entry, Mapping), "it must be an object")
             _require("camera_to_world" in entry, "camera_to_world is missing")
             _check_keys(entry, _NERFSTUDIO_FRAME_KEYS)
-            _refuse_other_frames(entry, size if width and height else None)
+            _refuse_other_times(entry)
             world_from_camera = _matrix(entry["camera_to_world"], "camera_to_world") @ np.diag([1.0, -1.0, -1.0, 1.0])
             camera = replace(default.resized(*size), camera_from_world=np.linalg.inv(world_from_camera))
             cameras.append(_with_fov(camera, _number(entry, "fov", _FOV_DEG) or 50.0))
@@ -220,15 +219,8 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[
     return cameras, False, _frame(content, "nerfstudio")
 
 
-def _refuse_other_frames(entry: Mapping[str, Any], size: tuple[int, int] | None) -> None:
-    """Raise ValueError for a frame of another shape than the film's, and for one of another time."""
-    aspect = _number(entry, "aspect", Range(0, 1e6, exclusive_min=True))
-    if aspect is not None and size is not None:
-        same = abs(aspect * size[1] / size[0] - 1) <= _SAME_ASPECT
-        _require(
-            same,
-            f"its aspect is {aspect:g}, but render_width and render_height say {size[0]}x{size[1]}: give one shape",
-        )
+def _refuse_other_times(entry: Mapping[str, Any]) -> None:
+    """Raise ValueError for a frame of another time."""
     moment = entry.get("render_time")
     _require(moment in (None, 0, 0.0), f"render_time is {moment!r}, and the scene stands still. Remove `render_time`")
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
@@ -30,8 +31,9 @@ def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[P
     """The photographs among the images below the folders, each with its mask or None; and what people should know.
 
     A folder `masks` (`mask`, `_masks`, ...) holds masks of what lies beside it, named like that, or like what lies in
-    `images` beside it. Where there is nothing but such folders, their images are photographs. An image beside a
-    photograph that is called `x_mask`, `mask_x` or `x.jpg.png` is its mask too.
+    `images` beside it, or in a folder of any name where no other has a photograph of that name. Where there is nothing
+    but such folders, their images are photographs. An image beside a photograph that is called `x_mask`, `mask_x` or
+    `x.jpg.png` is its mask too.
 
     Raises CaptureError for a folder of masks none of which is of a photograph.
     """
@@ -40,6 +42,10 @@ def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[P
     if not photographs:
         return dict.fromkeys(files), []
     adjacent = _beside_photographs(photographs)
+    within = defaultdict[Path, set[str]](set)
+    for file in photographs:
+        for parent, folder, inner in _in_folders_of(file, folders):
+            within[(parent / inner).with_suffix("")].add(folder)
     beside = {place.parent: place for place in places.values()}
     is_folder = cache(Path.is_dir)
     found = dict[Path, Path | None]()
@@ -47,7 +53,7 @@ def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[P
         if file in adjacent:
             continue
         found[file] = None
-        for parent, name in _mask_candidates(file, folders):
+        for parent, name in _mask_candidates(file, folders, within):
             if parent not in beside:
                 beside[parent] = next(
                     (parent / each for each in MASK_FOLDERS if is_folder(parent / each)), parent / MASK_FOLDER
@@ -96,17 +102,30 @@ def _masks_above(file: Path, folders: Sequence[Path]) -> Iterator[Path]:
             return
 
 
-def _mask_candidates(file: Path, folders: Sequence[Path]) -> Iterator[tuple[Path, str]]:
-    """Folders in whose `masks` a photograph's mask may lie, the nearest first, and what it is named like there."""
-    above = [folder for folder in folders if folder in file.parents]
-    top = min(above, key=lambda folder: len(folder.parts))
-    for parent in file.parents:
+def _in_folders_of(file: Path, folders: Sequence[Path]) -> Iterator[tuple[Path, str, Path]]:
+    """The folders above that of a photograph, nearest first, the folder in each that holds it, and its name there."""
+    for parent in file.parents[: file.parents.index(_top(file, folders)) + 1]:
         name = file.relative_to(parent)
-        yield parent, name.as_posix()
-        if name.parts[0].lower() == IMAGE_FOLDER and len(name.parts) > 1:
-            yield parent, name.relative_to(name.parts[0]).as_posix()
-        if parent == top:
-            break
+        if len(name.parts) > 1:
+            yield parent, name.parts[0], name.relative_to(name.parts[0])
+
+
+def _top(file: Path, folders: Sequence[Path]) -> Path:
+    """The highest of the folders that a file lies in."""
+    return min((folder for folder in folders if folder in file.parents), key=lambda folder: len(folder.parts))
+
+
+def _mask_candidates(
+    file: Path, folders: Sequence[Path], within: Mapping[Path, Collection[str]]
+) -> Iterator[tuple[Path, str]]:
+    """Folders in whose `masks` a photograph's mask may lie, the nearest first, and what it is named like there.
+    `within` says in which folders of a folder there are photographs of a name."""
+    top = _top(file, folders)
+    yield file.parent, file.name
+    for parent, folder, name in _in_folders_of(file, folders):
+        yield parent, file.relative_to(parent).as_posix()
+        if folder.lower() == IMAGE_FOLDER or len(within[(parent / name).with_suffix("")]) == 1:
+            yield parent, name.as_posix()
     if top.resolve().name.lower() == IMAGE_FOLDER:
         yield top.resolve().parent, file.relative_to(top).as_posix()
 
@@ -117,7 +136,7 @@ def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) ->
     for place in mask_folders:
         spare = [name for name, path in find_images(place).items() if path not in used]
         if spare and not any(place in mask.parents for mask in used):
-            example = mask_name(next(iter(found)).name)
+            example = mask_name(_named_from(place.parent, found))
             raise CaptureError(
                 f"{place}: holds {len(spare)} masks, none of them of a photograph. Name them like the photographs "
                 f"({example}; {spare[0]} is there), or rename the folder if these are photographs or not to be used."
@@ -132,6 +151,12 @@ def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) ->
             f"{without[0].name}, count whole."
         )
     return remarks
+
+
+def _named_from(folder: Path, photographs: Collection[Path]) -> str:
+    """What the first photograph below a folder is called there; of none below it, its own name."""
+    first = next((file for file in photographs if folder in file.parents), None)
+    return next(iter(photographs)).name if first is None else first.relative_to(folder).as_posix()
 
 
 def write_upright_masks(workspace: Workspace, photographs: Sequence[ImageMetadata], threads: int) -> None:

@@ -110,7 +110,7 @@ class CompensatedGrowth:
             if self.verbose:
                 print(f"Step {step}: {grown} Gaussians added, {pruned} removed, {len(params['means'])} now")
         if step > 0 and step % self.reset_every == 0:
-            limit = torch.tensor(2 * self.prune_opa).logit().item()
+            limit = torch.tensor(2 * self.prune_opa, dtype=torch.float32).logit().item()
             every = torch.arange(len(params["opacities"]), device=params["opacities"].device)
             changed = {"opacities": params["opacities"].clamp(max=limit)}
             _replace(params, optimizers, {}, every, torch.ones_like(every, dtype=torch.bool), changed)
@@ -127,7 +127,7 @@ class CompensatedGrowth:
             rows, center = info["gaussian_ids"], means2d
         for name in ("grad2d", "count", "seen", "cache"):
             if state[name] is None:
-                state[name] = torch.zeros(n, device=means2d.device)
+                state[name] = torch.zeros(n, device=means2d.device, dtype=torch.float32)
         images = info["n_cameras"] * info.get("n_batches", 1)
         norm = (gradient * (size / 2 * info["n_cameras"])).norm(dim=-1)
         inside = ((center >= 0) & (center < size)).all(-1)
@@ -166,7 +166,7 @@ class CompensatedGrowth:
     def _split(self, params: Params, parts: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         """What parts of split Gaussians have that their parents have not: places are drawn from the parent."""
         scales = params["scales"][parts].exp()
-        drawn = torch.randn(len(parts), 3, generator=generator).to(scales) * scales
+        drawn = torch.randn(len(parts), 3, generator=generator, dtype=torch.float32).to(scales) * scales
         moved = torch.einsum("pij,pj->pi", rotation_matrices(params["quats"][parts]), drawn)
         changed = {"means": params["means"][parts] + moved, "scales": (scales / SPLIT_SHRINK).log()}
         if self.revised_opacity:  # two parts let as much light through as their parent (arXiv:2404.06109)

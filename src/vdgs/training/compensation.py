@@ -41,7 +41,7 @@ class CompensationState:
 
     @staticmethod
     def zeros(n: int, k: int, device: torch.device | None = None) -> CompensationState:
-        return CompensationState(*(torch.zeros(n, k, device=device) for _ in range(3)))
+        return CompensationState(*(torch.zeros(n, k, device=device, dtype=torch.float32) for _ in range(3)))
 
     def tensors(self) -> dict[str, Tensor]:
         return {item.name: getattr(self, item.name) for item in fields(self)}

@@ -63,7 +63,7 @@ class RenderedTrainingView:
         g = self.pullback(image, alpha, depth, out=self.scratch, count=m)
         # In float32, as autograd divides.
         opacities = g.opacities if self.opacity_factors is None else g.opacities * self.opacity_factors
-        volume = float(torch.tensor(volume_weight) / m) if m else 0.0
+        volume = float(torch.tensor(volume_weight, dtype=torch.float32) / m) if m else 0.0
         return SplatGradients(
             means_px=g.means_px, conics=g.conics, colors=g.colors, opacities=opacities,
             volume=volume, source=self.source, color_values=self.colors, opacity_values=self.opacities,

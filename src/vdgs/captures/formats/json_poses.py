@@ -16,10 +16,12 @@ from vdgs.captures.formats.source_capture import (
     Intrinsics,
     check_centered,
     check_intrinsics,
+    safe_name,
     say_of_panoramas,
     to_rigid,
 )
 from vdgs.captures.image_files import read_header, same_aspect
+from vdgs.captures.name_resolution import find_file
 from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -32,6 +34,13 @@ _UNSCALE = (
     "The file is damaged or of another convention; if Blender wrote it, apply the scale of the camera and of what it "
     "hangs on (Ctrl-A, Scale), and export again."
 )
+
+
+def mask_of_frame(frame: JsonObject, file: Path, root: Path) -> Path | None:
+    """The mask that a frame names. Raises `CaptureError` for a path that leaves the capture."""
+    mask = frame.get("mask_path")
+    name = safe_name(str(mask), file, "mask_path", root) if mask else None
+    return (find_file(root, name) or root / name) if name else None
 
 
 def read_capture_json(file: Path) -> JsonObject:

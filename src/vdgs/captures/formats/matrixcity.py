@@ -10,6 +10,7 @@ transforms_train/transforms_test pairs (Blender): then the world's scale is not 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,6 +20,7 @@ from vdgs.captures.formats.frame_photographs import FramePhotographs
 from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
+    mask_of_frame,
     parse_intrinsics,
     parse_matrix,
     read_capture_json,
@@ -33,11 +35,15 @@ from vdgs.captures.formats.source_capture import (
     refuse_many_missing,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.captures.image_files import read_header
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
+from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 
+#: The photographs that do not train.
+TEST_FILE, VALIDATION_FILE = "transforms_test.json", "transforms_val.json"
 #: Unit of the pose files in metres.
 POSE_UNIT_M = 100.0
 #: The rotation in per-block files is this times a rotation.
@@ -49,10 +55,10 @@ CITY_PATTERN = re.compile(
 
 
 def pose_files(root: Path) -> list[tuple[Path, Split]]:
-    """The pose files of the layout with their split; empty if the folder is of another kind."""
-    pair: list[tuple[Path, Split]] = [
-        (root / "transforms_train.json", "train"), (root / "transforms_test.json", "test"),
-    ]  # fmt: skip
+    """The pose files of the layout with their split; empty if the folder is of another kind. Where a set has none for
+    the test, those for validation are."""
+    test = next((file for file in (root / TEST_FILE, root / VALIDATION_FILE) if file.is_file()), root / TEST_FILE)
+    pair: list[tuple[Path, Split]] = [(root / "transforms_train.json", "train"), (test, "test")]
     if pair[0][0].is_file():
         return [(file, split) for file, split in pair if file.is_file()]
     blocks: list[tuple[Path, Split]] = [(file, "train") for file in sorted(root.glob("train/*/transforms.json"))]
@@ -85,7 +91,7 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
                 missing.append(image)
                 continue
             try:
-                view, scale = _read_frame(image, frame, content, file, split)
+                view, scale = _read_frame(image, frame, content, file, split, root)
             except BadPose as error:
                 bad[image[0]] = error
                 continue
@@ -94,6 +100,8 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     warnings = _missing(missing, count, root / (options.images or ""), options.strict, is_city)
     views, both = _without_tested(views)
     views, warnings = one_view_each(views, root, bad), warnings + both
+    if any(file.name == VALIDATION_FILE for file, _ in files):
+        warnings += (f"there is no {TEST_FILE}: the photographs of {VALIDATION_FILE} are for the test.",)
     warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
     if is_city and len(scales) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
@@ -104,18 +112,15 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     if is_city:
         unit = scales.pop()
         world = WorldPrior(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
+    elif needs_points and any(_is_transparent(view.image_path) for view in views[:1]):
+        warnings += (
+            "what is transparent is left out of training and figures, as by a mask. Figures of sets of Blender are "
+            f"usual on white: without the points beside the set, vdgs sfm {shell_word(root)} --output CAPTURE makes it "
+            "white.",
+        )
     one_split = {view.split for view in views} == {"train"}
     if one_split:  # no test files: the split is ours to choose
-        views = [
-            SourceView(
-                name=v.name,
-                camera_from_world=v.camera_from_world,
-                intrinsics=v.intrinsics,
-                split=None,
-                image_path=v.image_path,
-            )
-            for v in views
-        ]
+        views = [replace(view, split=None) for view in views]
     return SourceCapture(
         source="matrixcity",
         images=options.images or "",
@@ -125,6 +130,10 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         world=world,
         warnings=warnings,
     )
+
+
+def _is_transparent(image: Path | None) -> bool:
+    return image is not None and read_header(image).mode in ("RGBA", "LA", "PA")
 
 
 def _of_a_city(frame: JsonObject) -> bool:
@@ -155,7 +164,7 @@ def _missing(missing: list[str], count: int, folder: Path, strict: bool, is_city
 
 
 def _read_frame(
-    found: tuple[str, Path], frame: JsonObject, content: JsonObject, file: Path, split: Split
+    found: tuple[str, Path], frame: JsonObject, content: JsonObject, file: Path, split: Split, root: Path
 ) -> tuple[SourceView, float]:
     """A view, and the unit of its world in metres if the file is MatrixCity's."""
     label = str(frame.get("file_path", frame.get("frame_index", "?")))
@@ -167,7 +176,7 @@ def _read_frame(
     name, image = found
     pose = np.linalg.inv(camera_motion(matrix, file, f"frame {label}"))
     common = {key: value for key, value in content.items() if key != "frames"}
-    intrinsics = parse_intrinsics(frame, common, image, file)
+    intrinsics, mask = parse_intrinsics(frame, common, image, file), mask_of_frame(frame, file, root)
     return SourceView(
-        name=name, camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image
+        name=name, camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image, mask_path=mask
     ), 1.0 if scaled else POSE_UNIT_M

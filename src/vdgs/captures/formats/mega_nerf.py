@@ -115,6 +115,11 @@ def _load(file: Path) -> JsonObject:
     except FileNotFoundError:
         raise CaptureError(f"{file}: no such file; Mega-NeRF's layout needs it.") from None
     except Exception as error:  # its parsers raise many kinds on damaged files
+        if "Unsupported global" in str(error):
+            raise CaptureError(
+                f"{file}: holds other things than tensors, texts and numbers, such as numbers of numpy, and these are "
+                "not read. Save it anew with tensors (torch.as_tensor) and numbers of Python (float)."
+            ) from None
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CaptureError(f"{file}: cannot be read as a torch file ({first}). Copy it again.") from None
     if not isinstance(content, dict):

@@ -17,6 +17,7 @@ from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
+    mask_of_frame,
     parse_intrinsics,
     parse_matrix,
     parse_number,
@@ -37,10 +38,11 @@ from vdgs.captures.formats.source_capture import (
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.image_files import find_images
-from vdgs.captures.name_resolution import find_file, find_in_other_folders, largest_shrunk
+from vdgs.captures.name_resolution import find_in_other_folders, largest_shrunk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
+from vdgs.system.quoting import shell_word
 
 TRANSFORMS_FILE = "transforms.json"
 #: Its lists of photographs, and the side that each is of.
@@ -108,7 +110,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
                 intrinsics=intrinsics,
                 split=splits.get(name),
                 image_path=image,
-                mask_path=_mask(frame, file, root),
+                mask_path=mask_of_frame(frame, file, root),
             )
         )
     warnings = notes + refuse_many_missing(missing, len(frames), root / chosen, options.strict)
@@ -132,6 +134,10 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
 
 def _file_path(frame: JsonObject, file: Path) -> str:
     path = frame.get("file_path")
+    if "frame_index" in frame and "file_path" not in frame:
+        city = file.absolute().parents[2]
+        here = shell_word(city) if file.absolute().parents[1].name == "train" else "CITY, with it as CITY/train/BLOCK"
+        raise CaptureError(f"{file}: is one block of MatrixCity. Give the folder above train/: {here}")
     if not isinstance(path, str):
         raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
     return path
@@ -170,12 +176,6 @@ def _find_photographs(written: list[str], file: Path, root: Path, options: Captu
         remedy = "Or say which folder they are in: --images FOLDER" if options.images is None else "Mend the paths."
         raise CaptureError(f"{outside} {remedy}") from outside
     return _Photographs(names, shorts, images, chosen, notes)
-
-
-def _mask(frame: JsonObject, file: Path, root: Path) -> Path | None:
-    mask = frame.get("mask_path")
-    name = safe_name(str(mask), file, "mask_path", root) if mask else None
-    return (find_file(root, name) or root / name) if name else None
 
 
 def _common_folder(names: list[str]) -> str:

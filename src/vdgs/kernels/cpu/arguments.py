@@ -13,6 +13,19 @@ def contiguous(tensor: Tensor) -> Tensor:
     return tensor.to(device="cpu", dtype=torch.float32).contiguous()
 
 
+def new_floats(*shape: int) -> Tensor:
+    """What a kernel fills, whatever torch's default dtype is."""
+    return torch.empty(shape, dtype=torch.float32)
+
+
+def check_outputs(**arguments: Tensor) -> None:
+    """Raise TypeError unless a kernel can write into each: of another dtype or strided, its binding would be handed a
+    copy, and the results would be lost."""
+    for name, tensor in arguments.items():
+        if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            raise TypeError(f"{name} must be float32 and contiguous, not {tensor.dtype} of strides {tensor.stride()}")
+
+
 def packed_camera(camera: Camera) -> Tensor:
     """The camera as the kernels read it, [23] float32."""
     return torch.from_numpy(camera.packed)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.arguments import new_floats
 from vdgs.kernels.torch_ref.harmonics import check_starts
 
 
@@ -16,7 +16,7 @@ def mean_ellipsoids(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:  # fmt: skip
     """As `torch_ref.mean_ellipsoids`. Same bits for any number of threads."""
     check_starts(starts, len(weights))
-    found = torch.empty(len(starts), 3), torch.empty(len(starts), 4)
+    found = new_floats(len(starts), 3), new_floats(len(starts), 4)
     given = (each.contiguous() for each in (log_scales, quaternions, weights))
     extension.get_extension().mean_ellipsoids(*given, starts, *found)
     return found

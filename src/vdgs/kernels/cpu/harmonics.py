@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.arguments import new_floats
 from vdgs.kernels.spherical_harmonics import num_sh_bases
 from vdgs.kernels.torch_ref.harmonics import check_coefficients, check_starts
 
@@ -19,7 +19,7 @@ def harmonic_colors(
     check_coefficients(coefficients, rows, degree)
     if coefficients.stride(1) != 1:
         coefficients = coefficients.contiguous()
-    colors = torch.empty(len(rows), 3)
+    colors = new_floats(len(rows), 3)
     extension.get_extension().harmonic_colors(means.contiguous(), coefficients, rows, eye.contiguous(), degree, colors)
     return colors
 
@@ -31,7 +31,7 @@ def fit_harmonics(
     """As `torch_ref.fit_harmonics`. Same bits for any number of threads."""
     f = num_sh_bases(degree)
     check_starts(starts, len(weights))
-    found = torch.empty(len(starts), 3 * f)
+    found = new_floats(len(starts), 3 * f)
     extension.get_extension().fit_harmonics(
         directions.contiguous(), colors.contiguous(), weights.contiguous(), starts, degree, ridge, found
     )

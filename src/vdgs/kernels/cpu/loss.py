@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.arguments import new_floats
 from vdgs.kernels.kernel_types import PhotometricLoss
 from vdgs.kernels.torch_ref.loss import check_images
 
@@ -31,7 +32,7 @@ def photometric_loss(
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Any:
-        gradient = torch.empty(image.shape) if ctx.needs_input_grad[0] else None
+        gradient = new_floats(*image.shape) if ctx.needs_input_grad[0] else None
         values = extension.get_extension().photometric_loss(
             image.detach().contiguous(),
             target.contiguous(),

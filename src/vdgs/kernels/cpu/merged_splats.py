@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.arguments import contiguous, packed_camera
+from vdgs.kernels.cpu.arguments import contiguous, new_floats, packed_camera
 from vdgs.kernels.kernel_types import SPLAT_TENSORS, MergedGaussians, Splats
 from vdgs.kernels.spherical_harmonics import num_sh_bases
 
@@ -22,7 +22,7 @@ def merged_splats(parts: Sequence[MergedGaussians], camera: Camera, before: Spla
     half precision or as float32. Raises ValueError for shapes that do not match."""
     first = 0 if before is None else len(before.depths)
     ends = list(accumulate((len(part.means) for part in parts), initial=first))
-    splats = Splats(*(torch.empty(ends[-1], *shape) for shape in ((2,), (3,), (), (3,), ())))
+    splats = Splats(*(new_floats(ends[-1], *shape) for shape in ((2,), (3,), (), (3,), ())))
     for name in SPLAT_TENSORS if before is not None else ():
         getattr(splats, name)[:first] = getattr(before, name)
     packed = packed_camera(camera)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vdgs.kernels.autograd import check_splats, rasterize_with_autograd
 from vdgs.kernels.cpu import extension as native_module
+from vdgs.kernels.cpu.arguments import check_outputs, new_floats
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, SplatContributions, Splats
 
 
@@ -50,7 +51,7 @@ def splat_contributions(
     ten. Same bits for any number of threads."""
     raster, pullback = _draw((*splats.tensors, background), width, height, False, module)
     lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
-    found = SplatContributions(torch.empty(pullback.count), torch.empty(pullback.count, 3))
+    found = SplatContributions(new_floats(pullback.count), new_floats(pullback.count, 3))
     pullback.module.rasterize_shares(pullback.frame, lacking.contiguous().numpy(), *(t.numpy() for t in found))
     return found
 
@@ -61,8 +62,8 @@ def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, mod
     if len(tensors[0]) >= 2**31:
         raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {len(tensors[0])}")
     module = module or native_module.get_extension()
-    depths = (torch.empty(height, width), torch.empty(height, width)) if depth else (None, None)
-    raster = Raster(torch.empty(height, width, 3), torch.empty(height, width), *depths)
+    depths = (new_floats(height, width), new_floats(height, width)) if depth else (None, None)
+    raster = Raster(new_floats(height, width, 3), new_floats(height, width), *depths)
     behind = tuple(tensors[5].tolist())
     frame = module.rasterize_forward(
         *(t.detach().contiguous().numpy() for t in tensors[:5]), behind, width, height,
@@ -90,11 +91,12 @@ class _Pullback:
         count: int | None = None,
     ) -> RasterGradients:
         n = self.count if count is None else count
-        means, conics = out or (torch.empty(n, 2), torch.empty(n, 3))
+        means, conics = out or (new_floats(n, 2), new_floats(n, 3))
         if not 0 <= n <= self.count or not len(means) == len(conics) == n:
             raise ValueError(f"gradients of {n} splats of {self.count} do not fit into {len(means)} and {len(conics)}")
-        colors, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
-        depths = torch.empty(n) if self.with_depth else None
+        check_outputs(means=means, conics=conics)
+        colors, opacities, background = new_floats(n, 3), new_floats(n), new_floats(3)
+        depths = new_floats(n) if self.with_depth else None
         found = RasterGradients(means, conics, colors, opacities, depths, background)
         self.module.rasterize_backward(
             self.frame, self.background,

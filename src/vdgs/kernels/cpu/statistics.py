@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.arguments import check_outputs
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.splat_segments import SplatMask, sources_tensor
 from vdgs.kernels.torch_ref.statistics import check_inside, check_sources
@@ -24,6 +25,7 @@ def add_view_statistics(
 ) -> None:
     """As `torch_ref.add_view_statistics`, for contiguous float32. Same bits for any number of threads."""
     gradient = statistics.gradient
+    check_outputs(**statistics.tensors())
     sources = sources_tensor(source)
     check_sources(sources, visible, gradient.shape[1])
     check_inside(inside, visible)

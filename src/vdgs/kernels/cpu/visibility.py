@@ -11,6 +11,7 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.arguments import new_floats
 from vdgs.kernels.cpu.cells import morton_order
 from vdgs.kernels.torch_ref.visibility import check_points
 
@@ -44,9 +45,9 @@ def fade_factors(
     threads. O(n) memory; a block of 512 neighbors that a camera does not reach costs one test."""
     check_points(points)
     if least <= 0 or len(cameras) < least:
-        return torch.full(points.shape[:1], float(least <= 0))
+        return torch.full(points.shape[:1], float(least <= 0), dtype=torch.float32)
     packed = np.stack([camera.packed_float64 for camera in cameras])
-    factors = torch.empty(points.shape[0])
+    factors = new_floats(points.shape[0])
     extension.get_extension().fade_factors(points.detach().contiguous(), packed, least, margin, factors)
     return factors
 

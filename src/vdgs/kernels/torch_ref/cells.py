@@ -34,7 +34,7 @@ def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[T
 
 def cell_centers(keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
     """Center of each cell, in the type of `origin`."""
-    shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0], device=keys.device)
+    shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0], device=keys.device, dtype=torch.int64)
     index = ((keys[:, None] >> shifts) & AXIS_MASK) - AXIS_OFFSET
     return ((index.to(torch.float64) + 0.5) * cell_size + origin.to(torch.float64)).to(origin.dtype)
 
