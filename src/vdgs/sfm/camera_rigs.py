@@ -50,6 +50,7 @@ def _join_sensors(workspace: Workspace, photographs: Sequence[ImageMetadata], mo
         first = max(prefixes, key=lambda prefix: len(frames[prefix]))
         known = [prefix for prefix in prefixes if len(frames[first] & frames[prefix]) >= MIN_FRAMES]
         if len(known) > 1:
+            known.sort(key=lambda prefix: prefix != first)  # COLMAP takes the reference first
             cameras = [pycolmap.RigConfigCamera(ref_sensor=prefix == first, image_prefix=prefix) for prefix in known]
             configs.append(pycolmap.RigConfig(cameras=cameras))
     if not configs:
