@@ -10,12 +10,18 @@ from pathlib import PurePosixPath
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
+from vdgs.errors import CaptureError
 from vdgs.sfm import incremental_mapper
+from vdgs.sfm.global_mapper import MAX_WORSE_PX
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.rig_folders import MIN_FRAMES
 from vdgs.sfm.workspace import Workspace, explain_colmap_errors
 from vdgs.system.lazy_pycolmap import pycolmap
+
+#: A model that holds rigs together has at least such a share of the observations of one that does not (choice).
+MIN_SEEN = 0.95
 
 
 def map_rigs(
@@ -27,14 +33,31 @@ def map_rigs(
     console: Console,
 ) -> None:
     """Make models again, with the cameras of rigs held together as those that were set aside have them; these are taken
-    back where they place more photographs, or do not tell."""
+    back, and why is said, where they fit the photographs better, or do not tell how the cameras lie."""
     loose = incremental_mapper.read_models(workspace, aside=True)[0]
-    before = loose.num_reg_images()  # joining changes the model
+    before = pycolmap.Reconstruction(loose)  # joining changes the model
+    why = "no exposure is placed with two of its cameras"
     if _join_sensors(workspace, photographs, loose):
-        incremental_mapper.run_mapper(workspace, count, fix_focal, threads, console)
-        if incremental_mapper.read_models(workspace)[0].num_reg_images() >= before:
-            return
-    incremental_mapper.take_models_back(workspace)
+        try:
+            incremental_mapper.run_mapper(workspace, count, fix_focal, threads, console)
+            why = _why_not(before, incremental_mapper.read_models(workspace)[0])
+        except CaptureError as error:
+            why = str(error)
+    if why:
+        incremental_mapper.take_models_back(workspace)
+        console.print(f"[yellow]note[/] the cameras of rigs are not held together: {escape(why)}", highlight=False)
+
+
+def _why_not(loose: pycolmap.Reconstruction, rigid: pycolmap.Reconstruction) -> str:
+    """Why a model that holds rigs together is not taken in place of one that does not; empty where it is. Cameras that
+    are in truth not fixed to each other are placed so, too, but away from what they show."""
+    if rigid.num_reg_images() < loose.num_reg_images():
+        return "fewer photographs are placed then"
+    worse = rigid.compute_mean_reprojection_error() - loose.compute_mean_reprojection_error()
+    seen = rigid.compute_num_observations() / loose.compute_num_observations()
+    if worse > MAX_WORSE_PX or seen < MIN_SEEN:
+        return f"of what photographs show {seen:.0%} are left then, {worse:+.2f} px farther off"
+    return ""
 
 
 def _join_sensors(workspace: Workspace, photographs: Sequence[ImageMetadata], model: pycolmap.Reconstruction) -> bool:
