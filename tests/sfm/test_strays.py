@@ -178,6 +178,18 @@ def test_smaller_copies_in_another_folder_are_left_out(tmp_path):
     assert all("smaller copy of full/" in each.reason for each in found.excluded)
 
 
+@pytest.mark.parametrize(("late_s", "east_m"), [(1800, 0.0), (0, 50.0)])
+def test_smaller_photographs_of_another_flight_are_no_copies(tmp_path, late_s, east_m):
+    """Whose files count from 1 again: 48 megapixels, then 12."""
+    for folder, count, size, late, east in (("1", 6, (320, 240), 0, 0.0), ("2", 4, (160, 120), late_s, east_m)):
+        (tmp_path / folder).mkdir()
+        for k in range(count):
+            place = np.array([10.0 * k + east, 0.0, 40.0])
+            write_photograph(tmp_path / folder / f"DJI_{k:04d}.JPG", pixels(k, *size), k + late, place)
+    found = collect_images([tmp_path])
+    assert (len(found.images), found.excluded) == (10, ())
+
+
 def test_a_photograph_that_lost_its_tags_is_used_as_the_others_of_its_size(tmp_path):
     names = flight(tmp_path)
     picture(tmp_path / names[2], pixels(2), quality=95)

@@ -40,6 +40,8 @@ _COPY_NAME = re.compile(
     re.IGNORECASE,
 )
 _SAME_MOMENT = timedelta(seconds=2)
+#: Programs that convert photographs may round places by so much (about a metre; choice).
+_ROUNDED_DEG = 1e-5
 #: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
 _PREFERRED = ("panchro", "green", "red", "blue")
 #: Fewer color photographs than this share of the exposures are none of the set.
@@ -229,18 +231,34 @@ def _other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     return found
 
 
+def taken_apart(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether two photographs were taken at other moments or places, as far as both say it."""
+    moments, places = (photo.datetime, other.datetime), (photo.lat_lon, other.lat_lon)
+    apart = all(moments) and moments[0] != moments[1]
+    if places[0] is not None and places[1] is not None:
+        apart |= bool(np.abs(np.subtract(places[0], places[1])).max() > _ROUNDED_DEG)
+    return apart
+
+
 def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
-    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder."""
+    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder, and not of another
+    flight, whose files count from 1 again."""
     stems: dict[str, list[ImageMetadata]] = {}
     for photo in photographs:
         stems.setdefault(PurePosixPath(photo.name).stem.lower(), []).append(photo)
     usual = Counter(photo.size for photo in photographs).most_common(1)[0][0] if photographs else (0, 0)
     reasons = {}
     for alike in stems.values():
-        largest = max(alike, key=lambda photo: photo.width * photo.height)
         for photo in alike:
-            small = max(photo.size) <= SMALLER * max(largest.size) and photo.size != usual
-            if small and same_aspect(photo.size, largest.size):
+            larger = [
+                other
+                for other in alike
+                if max(photo.size) <= SMALLER * max(other.size)
+                and same_aspect(photo.size, other.size)
+                and not taken_apart(photo, other)
+            ]
+            if larger and photo.size != usual:
+                largest = max(larger, key=lambda other: other.width * other.height)
                 reasons[photo.name] = f"is a smaller copy of {largest.name}"
     return reasons
 
