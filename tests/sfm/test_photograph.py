@@ -317,10 +317,9 @@ def test_links_to_what_is_not_there_are_said(tmp_path):
 
 
 def test_folders_are_told_apart(tmp_path):
-    for name in ("a/card", "b/card"):
-        flight(tmp_path / name, 2)
-    (tmp_path / "b/card/p01.jpg").write_bytes((tmp_path / "b/card/p01.jpg").read_bytes() + b"\0")
-    (tmp_path / "b/card/p00.jpg").write_bytes((tmp_path / "b/card/p00.jpg").read_bytes() + b"\0")
+    for name, north in (("a/card", 0.0), ("b/card", 30.0)):
+        for k in range(2):
+            photograph(tmp_path / name, k, (10.0 * k, north, 40.0))
     found = collect_images([tmp_path / "a/card", tmp_path / "b/card"])
     assert [photo.name for photo in found.images] == [f"card_{n}/p0{k}.jpg" for n in (1, 2) for k in (0, 1)]
 

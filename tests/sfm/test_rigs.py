@@ -59,7 +59,7 @@ def fly(folder: Path, late_s: float = 0.0, away_m: float = 0.0, pitch: float = -
     folder.mkdir(parents=True)
     for k in range(8):
         yaw = 180.0 * (k >= 4) * turns
-        pixels = np.random.default_rng([k, len(folder.name)]).integers(0, 255, (120, 160, 3), np.uint8)
+        pixels = np.random.default_rng([k, *folder.name.encode()]).integers(0, 255, (120, 160, 3), np.uint8)
         xmp = f'drone-dji:GimbalPitchDegree="{pitch}" drone-dji:GimbalYawDegree="{yaw}" drone-dji:GimbalRollDegree="0"'
         place = np.array([12.0 * k + away_m, 0.0, 40.0])
         write_photograph(folder / f"{k:04d}.JPG", pixels, round(5 * k + late_s), place, xmp=xmp)

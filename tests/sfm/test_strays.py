@@ -190,6 +190,33 @@ def test_smaller_photographs_of_another_flight_are_no_copies(tmp_path, late_s, e
     assert (len(found.images), found.excluded) == (10, ())
 
 
+def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
+    """Edited or raw; and not what another camera of a rig shows, at the same moments and places."""
+    names = flight(tmp_path / "z")
+    for k, name in enumerate(names):
+        with Image.open(tmp_path / "z" / name) as image:
+            exif, shown = image.getexif(), np.asarray(image)
+        if k < 4:  # brighter, and without contrast in the lights
+            picture(tmp_path / "edited" / name, (255 * (shown / 255) ** 0.6).clip(20, 230).astype(np.uint8), exif=exif)
+        picture(tmp_path / "other camera" / name, pixels(50 + k), exif=exif)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [
+        f"{folder}/{n}" for folder in ("other_camera", "z") for n in names
+    ]
+    assert all(f"another version of z/{each.name[-12:]}" in each.reason for each in found.excluded)
+
+
+def test_raw_files_in_a_folder_beside_their_pictures_are_left_out(tmp_path):
+    pytest.importorskip("rawpy")
+    (tmp_path / "JPG").mkdir()
+    for k in range(4):
+        write_dng(tmp_path / f"DNG/p{k}.dng", pixels(k))
+        write_photograph(tmp_path / f"JPG/p{k}.jpg", pixels(k, 152, 120), 0, np.array([10.0 * k, 0, 40]))
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [f"JPG/p{k}.jpg" for k in range(4)]
+    assert all("another version of JPG/" in each.reason for each in found.excluded)
+
+
 def test_a_photograph_that_lost_its_tags_is_used_as_the_others_of_its_size(tmp_path):
     names = flight(tmp_path)
     picture(tmp_path / names[2], pixels(2), quality=95)
