@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from vdgs.captures.image_files import open_image, same_aspect
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
-from vdgs.sfm.focal_length import Lens, unzoomed
+from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
 #: Focal lengths within this share of each other are one.
@@ -100,8 +100,24 @@ def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:
                 photo = replace(photo, lens=unzoomed(lens))
             elif not whole and not lens.zoom_confirmed and lens.zoom > 1 + ONE_FOCAL:
                 photo = _doubted(photo, lens)
+        elif lens is not None and _lacks_zoom(lens, group):
+            doubt = "the 35 mm equivalent is that of photographs without digital zoom; multiplied by DigitalZoomRatio"
+            photo = replace(photo, lens=zoomed(lens), doubts=(*photo.doubts, doubt))
         found.append(photo)
     return found
+
+
+def _lacks_zoom(lens: Lens, group: list[ImageMetadata]) -> bool:
+    """Whether the 35 mm equivalent that a focal length is from lacks the digital zoom: others of the camera say the
+    same without zoom, and none says what would be left without it."""
+    zoom, focal_mm = lens.digital_zoom, lens.focal_mm or 0.0
+    if lens.source != EQUIVALENT or zoom <= 1 + ONE_FOCAL:
+        return False
+    others = [each.lens for each in group if each.lens and each.lens.digital_zoom == 1]
+    others = [each for each in others if any(_near_or_none(each.focal_mm, mm) for mm in (focal_mm, focal_mm / zoom))]
+    return any(_near(each.focal, lens.focal) for each in others) and not any(
+        _near(each.focal, lens.focal / zoom) for each in others
+    )
 
 
 def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
@@ -136,6 +152,10 @@ def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
 
 def _near(one: float, other: float) -> bool:
     return abs(one / other - 1) < ONE_FOCAL
+
+
+def _near_or_none(one: float | None, other: float) -> bool:
+    return not one or not other or _near(one, other)
 
 
 def _one_altitude(group: list[ImageMetadata]) -> list[ImageMetadata]:

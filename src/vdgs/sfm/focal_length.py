@@ -50,6 +50,8 @@ class Lens:
     """What contradicts it; a focal length that is doubted is fitted."""
     zoom: float = 1.0
     """The digital zoom that `focal` is multiplied by."""
+    digital_zoom: float = 1.0
+    """EXIF's DigitalZoomRatio, which the 35 mm equivalent contains as a rule."""
     focal_mm: float | None = None
     """EXIF's FocalLength."""
     zoom_confirmed: bool = False
@@ -87,13 +89,18 @@ def read_lens(
     confirmed = as_written is not None and _alike(as_written, focal) and not _alike(as_written, focal / zoom)
     if unclear and not cut:
         doubt = "; ".join(filter(None, (unclear, doubt)))
-    zoom = 1.0 if source == EQUIVALENT else zoom
-    return Lens(focal, source, doubt, zoom, focal_mm, confirmed, remark=unclear if cut else "")
+    counted = 1.0 if source == EQUIVALENT else zoom
+    return Lens(focal, source, doubt, counted, zoom, focal_mm, confirmed, remark=unclear if cut else "")
 
 
 def unzoomed(lens: Lens) -> Lens:
     """The lens where EXIF's focal length has the digital zoom in it already."""
     return replace(lens, focal=lens.focal / lens.zoom, zoom=1.0)
+
+
+def zoomed(lens: Lens) -> Lens:
+    """The lens where the 35 mm equivalent lacks the digital zoom."""
+    return replace(lens, focal=lens.focal * lens.digital_zoom, zoom=lens.digital_zoom)
 
 
 def _agreed(known: list[tuple[float, str]], longer: int, copied: bool) -> tuple[float, str, str]:
