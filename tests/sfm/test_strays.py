@@ -114,7 +114,7 @@ def test_masks_of_every_scale_keep_the_same(tmp_path, kind):
     [
         ".Trashes/501", ".thumbnails", "@eaDir", "__MACOSX", "$RECYCLE.BIN", "System Volume Information", "thumbnails",
         "Thumbs", "odm_orthophoto", "odm_texturing/x", "opensfm/undistorted/images", "dsm", "orthophoto", "3_dsm_ortho",
-        "project.files/0/0", "depth_maps", "renders", ".git/x",
+        "project.files/0/0", "depth_maps", "renders", ".git/x", "Proxy", "Transcoded Media/Proxy Media",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("tagged", [True, False])
