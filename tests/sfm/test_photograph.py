@@ -190,6 +190,14 @@ def test_the_focal_length_is_the_best_that_is_known(tags, details, xmp, focal):
         assert (lens and lens.focal) == (focal and pytest.approx(focal, abs=1e-3))
 
 
+@pytest.mark.parametrize(("width", "height"), [(5472, 3648), (4864, 3648), (5472, 3078), (3648, 4864), (2432, 1824)])
+def test_a_sensor_of_the_table_is_used_as_far_as_the_shape_of_the_picture_needs_it(width, height):
+    """The Phantom 4 Pro: 5472 x 3648 pixels on 13.2 mm, of which 4 x 3 takes 4864 and 16 x 9 all."""
+    lens = read_lens({0x0110: "FC6310"}, {0x920A: 8.8}, {}, width, height)
+    shrunk = 2 if max(width, height) == 2432 else 1
+    assert shrunk * lens.focal * max(width, height) == pytest.approx(8.8 / 13.2 * 5472, rel=2e-3)
+
+
 # ------------------------------------------------------------------------------------------------- positions
 
 
