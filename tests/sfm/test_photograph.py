@@ -34,7 +34,7 @@ from vdgs.sfm.image_metadata import (
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
-from vdgs.sfm.reconstruction_report import _photographs
+from vdgs.sfm.reconstruction_report import _photographs, _warnings
 from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -283,6 +283,13 @@ def test_what_is_left_out_is_called_by_its_own_name(tmp_path):
     assert any("p00_again.jpg is 'p00 again.jpg'" in note for note in found.notes)
     photographs = _photographs(found, positions_of(found.images), None, ())
     assert excluded_lines(SimpleNamespace(photographs=photographs)) == [each.line for each in found.excluded]
+
+
+@pytest.mark.parametrize(("tilt", "said"), [(2.0, True), (50.0, True), (88.0, False), (None, False)])
+def test_the_height_over_the_median_point_is_compared_where_views_show_the_ground(tilt, said):
+    """Of a facade that point is a wall's."""
+    found = _warnings((), True, height=0.3, recorded=12.5, turned=1.0, tilt=tilt)
+    assert bool(found) == said
 
 
 def test_photographs_of_one_name_are_told_apart_by_moment_and_place(tmp_path):

@@ -28,6 +28,9 @@ from vdgs.system.lazy_pycolmap import pycolmap
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 MAX_TILT_DEG = 3.0
+#: Views that look less down than this (degrees from straight down; median) show walls: the height of the median point
+#: is not that of the ground (choice).
+LEVEL_TILT_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,7 +67,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, collection.images) if metric else None
-    warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
+    warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned, tilt)]
     warnings += _survey_warnings(result.found.survey)
     if any(photo.sensor for photo in collection.images):
         warnings += describe_rigs(model, "m" if metric else "units of the model")
@@ -199,7 +202,12 @@ def _photographs(
 
 
 def _warnings(
-    cameras: Sequence[CameraReport], held: bool, height: float | None, recorded: float | None, turned: float | None
+    cameras: Sequence[CameraReport],
+    held: bool,
+    height: float | None,
+    recorded: float | None,
+    turned: float | None,
+    tilt: float | None,
 ) -> list[str]:
     found = []
     for camera in cameras:
@@ -209,7 +217,8 @@ def _warnings(
                 f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if "
                 "heights look wrong, hold it: --focal fixed"
             )
-    if height is not None and recorded is not None and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
+    sees_ground = tilt is not None and tilt < LEVEL_TILT_DEG
+    if sees_ground and height is not None and recorded and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
         found.append(
             f"the cameras are {height:.1f} m over the median point, the drone recorded {recorded:.1f} m over its "
             "take-off: another level of ground, or a focal length that is not right."
