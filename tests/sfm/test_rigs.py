@@ -128,10 +128,10 @@ def matched(workspace: Workspace, poses: dict[str, np.ndarray], points: np.ndarr
             database.write_two_view_geometry(one, other, geometry)
 
 
-def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0):
-    """A flight of two cameras, its photographs, and the models without rigs and after `map_rigs`. The second camera is
-    off its place on the rig by `shaken_m` (standard deviation)."""
-    flight, rng = known_flight(strips=2, each=4), np.random.default_rng(0)
+def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0, mixed: bool = False):
+    """A flight of two cameras, its photographs, the models without rigs and after `map_rigs`, and what is said. The
+    second camera is off its place on the rig by `shaken_m` (standard deviation), or flies in a `mixed` order."""
+    flight, rng, console = known_flight(strips=2, each=4), np.random.default_rng(0), Console(file=io.StringIO())
     names = [f"cam{s}/{k:04d}.jpg" for s in range(2) for k in range(8)]
     photographs(folder / "photos", names)
     images = collect_images([folder / "photos"]).images
@@ -139,7 +139,9 @@ def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0):
     workspace = Workspace(folder / "work")
     create_database(workspace, group_by_camera(images))
     poses = {f"cam0/{k:04d}.jpg": pose[:3] for k, pose in enumerate(flight.poses)}
-    for name, pose in list(poses.items()):
+    firsts = list(poses.items())
+    for (name, _), number in zip(firsts, rng.permutation(8) if mixed else range(8), strict=True):
+        pose = firsts[number][1]
         place = SECOND[:, :3] @ pose[:, 3:] + SECOND[:, 3:] + rng.normal(0, shaken_m, (3, 1))
         poses[f"cam1/{name[5:]}"] = np.hstack([SECOND[:, :3] @ pose[:, :3], place])
     poses.pop(lost, None)
@@ -148,15 +150,15 @@ def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0):
     silence_colmap()
     incremental_mapper.run_mapper(workspace, 16, True, 1, CONSOLE)
     incremental_mapper.set_models_aside(workspace)
-    map_rigs(workspace, images, 16, True, 1, CONSOLE)
+    map_rigs(workspace, images, 16, True, 1, console)
     loose, model = (incremental_mapper.read_models(workspace, aside)[0] for aside in (True, False))
-    return flight, len(poses), loose, model
+    return flight, len(poses), loose, model, " ".join(console.file.getvalue().split())
 
 
 @pytest.mark.parametrize("lost", [pytest.param(None, id="whole"), "cam0/0003.jpg"])
 def test_a_rig_is_measured_and_held_together(tmp_path, lost):
     """Its second camera lies as it truly does, in one frame with the first, of which a photograph may be lost."""
-    flight, count, _, model = mapped(tmp_path, lost)
+    flight, count, _, model, _ = mapped(tmp_path, lost)
     assert (model.num_reg_images(), model.num_reg_frames()) == (count, 8)
     rig = next(each for each in model.rigs.values() if each.num_sensors() == 2)
     second_from_first = next(iter(rig.non_ref_sensors.values()))
@@ -170,8 +172,16 @@ def test_a_rig_is_measured_and_held_together(tmp_path, lost):
     assert len(describe_rigs(model, "m")) == 1
 
 
-def test_cameras_that_are_not_fixed_to_each_other_are_not_held_together(tmp_path):
-    """Where all photographs are placed, too, but half a metre off."""
-    _, _, loose, model = mapped(tmp_path, shaken_m=0.5)
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        pytest.param({"shaken_m": 0.5}, "px farther off", id="half a metre off"),
+        pytest.param({"mixed": True}, "no two of them are", id="another flight"),
+    ],
+)
+def test_cameras_that_are_not_fixed_to_each_other_are_not_held_together(tmp_path, how, said):
+    """Where COLMAP places all photographs, too, as a rig."""
+    _, _, loose, model, notes = mapped(tmp_path, **how)
     assert (model.num_reg_images(), model.num_reg_frames()) == (16, 16)
     assert model.compute_mean_reprojection_error() == loose.compute_mean_reprojection_error()
+    assert said in notes

@@ -128,8 +128,12 @@ def _turns(frames: Frames) -> np.ndarray | None:
     known = [(one.attitude, other.attitude) for one, other in frames if one.attitude and other.attitude]
     if len(known) < MIN_FRAMES:
         return None
-    turns = np.array([other.camera_from_enu @ one.camera_from_enu.T for one, other in known])
-    left, _, right = np.linalg.svd(turns.sum(axis=0))
+    return degrees_from_mean(np.array([other.camera_from_enu @ one.camera_from_enu.T for one, other in known]))
+
+
+def degrees_from_mean(rotations: np.ndarray) -> np.ndarray:
+    """By how many degrees each rotation [n, 3, 3] is turned from the mean of all."""
+    left, _, right = np.linalg.svd(rotations.sum(axis=0))
     mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    cosines = (np.einsum("nij,ij->n", turns, mean) - 1) / 2
+    cosines = (np.einsum("nij,ij->n", rotations, mean) - 1) / 2
     return np.asarray(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
