@@ -43,7 +43,7 @@ def photographs(folder: Path, names: list[str]) -> None:
 def test_folders_tell_rigs(tmp_path, folders, rigs):
     photographs(tmp_path, [f"{folder}/{k:04d}.jpg" for folder in folders for k in range(4)])
     found = collect_images([tmp_path])
-    assert sum("taken for one rig" in note for note in found.notes) == rigs
+    assert sum("tried as one rig" in note for note in found.notes) == rigs
     sensors = {photo.sensor for photo in found.images if photo.sensor}
     assert sensors == ({f"{each}/" for each in folders if not each.startswith("b/")} if rigs else set())
     assert len(group_by_camera(found.images)) == max(1, len(sensors) + ("b/cam1" in folders))

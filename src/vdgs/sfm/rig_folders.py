@@ -49,7 +49,7 @@ def with_sensors(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetada
             sensor_of |= {photo.name: prefix for prefix in together for photo in sensors[prefix]}
             names = ", ".join(PurePosixPath(prefix).name for prefix in together)
             where = "" if parent == "." else f" in {parent}"
-            notes.append(f"{names}{where} have the same names: taken for one rig of {len(together)} cameras.")
+            notes.append(f"{names}{where} have the same names: tried as one rig of {len(together)} cameras.")
     return [replace(photo, sensor=sensor_of.get(photo.name, "")) for photo in photographs], notes
 
 
