@@ -34,7 +34,7 @@ from vdgs.sfm.image_metadata import (
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
-from vdgs.sfm.reconstruction_report import _photographs, _warnings
+from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
 from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -290,6 +290,22 @@ def test_the_height_over_the_median_point_is_compared_where_views_show_the_groun
     """Of a facade that point is a wall's."""
     found = _warnings((), True, height=0.3, recorded=12.5, turned=1.0, tilt=tilt)
     assert bool(found) == said
+
+
+@pytest.mark.parametrize(
+    ("lower", "others", "said"),
+    [
+        pytest.param(12.0, 0.6, True, id="a wrong tag"),
+        pytest.param(0.3, 0.6, False, id="a lens that zooms"),
+        pytest.param(12.0, 1.0, False, id="one focal length"),
+    ],
+)
+def test_a_focal_length_of_few_that_moves_them_is_named(tmp_path, lower, others, said):
+    seen = [photograph(tmp_path, k, focal_mm=8.5 * (others if k < 2 else 1)) for k in range(8)]
+    off = {photo.name: -lower * (k < 2) + 0.1 * k for k, photo in enumerate(seen)}
+    assert ["the 2 photographs with a focal length of 82 px" in each for each in _lens_warnings(seen, off, 40.0)] == (
+        [True] if said else []
+    )
 
 
 def test_photographs_of_one_name_are_told_apart_by_moment_and_place(tmp_path):
