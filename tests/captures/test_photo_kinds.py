@@ -97,6 +97,32 @@ def test_cmyk_becomes_rgb(tmp_path):
     assert verify_image(tmp_path / "print.jpg").has_content
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", [None, "tiff_lzw", "I;16", "profile"])
+def test_tiffs_are_taken_as_their_files_have_them(tmp_path, orientation, kind):
+    """As all others are, although Pillow and OpenCV turn them upright by themselves."""
+    file, exif = tmp_path / "a.tif", Image.Exif()
+    exif[0x0112] = orientation
+    pixels = patches()
+    pixels[:60] //= 2
+    expected = pixels
+    if kind == "I;16":
+        expected = pixels[..., :1].repeat(3, axis=2)
+        Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(file, exif=exif)
+    elif kind == "profile":
+        Image.fromarray(pixels).save(file, exif=exif, icc_profile=matrix_profile("Display P3", *DISPLAY_P3))
+        plain = tmp_path / "plain.png"
+        Image.fromarray(pixels).save(plain, icc_profile=matrix_profile("Display P3", *DISPLAY_P3))
+        expected = decode_image(plain)[0]
+    else:
+        Image.fromarray(pixels).save(file, exif=exif, compression=kind)
+    found, header = read_tags(file), read_header(file)
+    assert found.tags[0x0112] == orientation
+    assert (found.width, found.height) == (header.width, header.height) == (WIDE * len(COLORS), 120)
+    assert np.array_equal(decode_image(file)[0], expected)
+    assert verify_image(file).has_content
+
+
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("gray", [False, True])
 def test_16_bits_become_8(tmp_path, suffix, gray):

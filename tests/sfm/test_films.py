@@ -138,6 +138,8 @@ def test_positions_lie_between_those_of_the_records_and_are_not_made_up():
     assert between.lat_lon == pytest.approx((47.025, 8.1))
     assert between.relative_altitude == pytest.approx(12.5)
     assert telemetry_at(records, 60.0).lat_lon is None
+    assert telemetry_at(records, 0.2).lat_lon == records[0].lat_lon
+    assert [telemetry_at(records, outside).lat_lon for outside in (-0.2, 3.5)] == [None, None]
     assert telemetry_at((), 1.0).lat_lon is None
 
 
@@ -298,6 +300,17 @@ def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path):
     for photo in images.images:
         number = int(photo.path.stem.rpartition("_")[2])
         assert photo.lat_lon == pytest.approx((47 + number * 1e-5, 8.2), abs=2e-7)
+
+
+def test_subtitles_of_other_times_give_no_positions_and_are_named(tmp_path):
+    """Of the second part of a flight, counted from the beginning of the first."""
+    film = tmp_path / "DJI_2.MP4"
+    write_film(film, crops(panorama(), [5 * k for k in range(30)]))
+    block = "{n}\n00:05:{n:02d},000 --> 00:05:{n:02d},900\n[latitude: 47.0] [longitude: 8.{n}]\n"
+    (tmp_path / "DJI_2.SRT").write_text("\n".join(block.format(n=n) for n in range(3)))
+    found, said = take(ask(tmp_path / "out", film))
+    assert all(photo.lat_lon is None for photo in found.images)
+    assert "no positions: those of DJI_2.SRT are of other times (5 min 00 s to 5 min 02 s)" in said
 
 
 def test_a_film_that_lies_on_its_side_becomes_upright(tmp_path: Path):

@@ -34,7 +34,7 @@ from vdgs.sfm.image_metadata import (
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
-from vdgs.sfm.reconstruction_report import _photographs
+from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
 from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -190,6 +190,14 @@ def test_the_focal_length_is_the_best_that_is_known(tags, details, xmp, focal):
         assert (lens and lens.focal) == (focal and pytest.approx(focal, abs=1e-3))
 
 
+@pytest.mark.parametrize(("width", "height"), [(5472, 3648), (4864, 3648), (5472, 3078), (3648, 4864), (2432, 1824)])
+def test_a_sensor_of_the_table_is_used_as_far_as_the_shape_of_the_picture_needs_it(width, height):
+    """The Phantom 4 Pro: 5472 x 3648 pixels on 13.2 mm, of which 4 x 3 takes 4864 and 16 x 9 all."""
+    lens = read_lens({0x0110: "FC6310"}, {0x920A: 8.8}, {}, width, height)
+    shrunk = 2 if max(width, height) == 2432 else 1
+    assert shrunk * lens.focal * max(width, height) == pytest.approx(8.8 / 13.2 * 5472, rel=2e-3)
+
+
 # ------------------------------------------------------------------------------------------------- positions
 
 
@@ -277,6 +285,29 @@ def test_what_is_left_out_is_called_by_its_own_name(tmp_path):
     assert excluded_lines(SimpleNamespace(photographs=photographs)) == [each.line for each in found.excluded]
 
 
+@pytest.mark.parametrize(("tilt", "said"), [(2.0, True), (50.0, True), (88.0, False), (None, False)])
+def test_the_height_over_the_median_point_is_compared_where_views_show_the_ground(tilt, said):
+    """Of a facade that point is a wall's."""
+    found = _warnings((), True, height=0.3, recorded=12.5, turned=1.0, tilt=tilt)
+    assert bool(found) == said
+
+
+@pytest.mark.parametrize(
+    ("lower", "others", "said"),
+    [
+        pytest.param(12.0, 0.6, True, id="a wrong tag"),
+        pytest.param(0.3, 0.6, False, id="a lens that zooms"),
+        pytest.param(12.0, 1.0, False, id="one focal length"),
+    ],
+)
+def test_a_focal_length_of_few_that_moves_them_is_named(tmp_path, lower, others, said):
+    seen = [photograph(tmp_path, k, focal_mm=8.5 * (others if k < 2 else 1)) for k in range(8)]
+    off = {photo.name: -lower * (k < 2) + 0.1 * k for k, photo in enumerate(seen)}
+    assert ["the 2 photographs with a focal length of 82 px" in each for each in _lens_warnings(seen, off, 40.0)] == (
+        [True] if said else []
+    )
+
+
 def test_photographs_of_one_name_are_told_apart_by_moment_and_place(tmp_path):
     """Other endings: both are used where both were taken. Other cases: many disks hold one of the two alone."""
     flight(tmp_path)
@@ -317,10 +348,9 @@ def test_links_to_what_is_not_there_are_said(tmp_path):
 
 
 def test_folders_are_told_apart(tmp_path):
-    for name in ("a/card", "b/card"):
-        flight(tmp_path / name, 2)
-    (tmp_path / "b/card/p01.jpg").write_bytes((tmp_path / "b/card/p01.jpg").read_bytes() + b"\0")
-    (tmp_path / "b/card/p00.jpg").write_bytes((tmp_path / "b/card/p00.jpg").read_bytes() + b"\0")
+    for name, north in (("a/card", 0.0), ("b/card", 30.0)):
+        for k in range(2):
+            photograph(tmp_path / name, k, (10.0 * k, north, 40.0))
     found = collect_images([tmp_path / "a/card", tmp_path / "b/card"])
     assert [photo.name for photo in found.images] == [f"card_{n}/p0{k}.jpg" for n in (1, 2) for k in (0, 1)]
 

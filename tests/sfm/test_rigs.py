@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from support.flights import write_photograph
 from support.known_flight import known_flight
 from vdgs.sfm import incremental_mapper
 from vdgs.sfm.camera_rigs import describe_rigs, map_rigs
@@ -42,7 +43,7 @@ def photographs(folder: Path, names: list[str]) -> None:
 def test_folders_tell_rigs(tmp_path, folders, rigs):
     photographs(tmp_path, [f"{folder}/{k:04d}.jpg" for folder in folders for k in range(4)])
     found = collect_images([tmp_path])
-    assert sum("taken for one rig" in note for note in found.notes) == rigs
+    assert sum("tried as one rig" in note for note in found.notes) == rigs
     sensors = {photo.sensor for photo in found.images if photo.sensor}
     assert sensors == ({f"{each}/" for each in folders if not each.startswith("b/")} if rigs else set())
     assert len(group_by_camera(found.images)) == max(1, len(sensors) + ("b/cam1" in folders))
@@ -51,6 +52,55 @@ def test_folders_tell_rigs(tmp_path, folders, rigs):
 def test_cameras_that_do_not_release_together_are_no_rig(tmp_path):
     photographs(tmp_path, [f"cam{s}/{10 * s + k:04d}.jpg" for s in range(2) for k in range(5)])
     assert not any(photo.sensor for photo in collect_images([tmp_path]).images)
+
+
+def fly(folder: Path, late_s: float = 0.0, away_m: float = 0.0, pitch: float = -60.0, turns: bool = True) -> None:
+    """Eight photographs 12 m apart: two strips, along which a camera that `turns` looks the other way."""
+    folder.mkdir(parents=True)
+    for k in range(8):
+        yaw = 180.0 * (k >= 4) * turns
+        pixels = np.random.default_rng([k, *folder.name.encode()]).integers(0, 255, (120, 160, 3), np.uint8)
+        xmp = f'drone-dji:GimbalPitchDegree="{pitch}" drone-dji:GimbalYawDegree="{yaw}" drone-dji:GimbalRollDegree="0"'
+        place = np.array([12.0 * k + away_m, 0.0, 40.0])
+        write_photograph(folder / f"{k:04d}.JPG", pixels, round(5 * k + late_s), place, xmp=xmp)
+
+
+@pytest.mark.parametrize(
+    ("second", "why"),
+    [
+        pytest.param({"pitch": -90.0}, "", id="a rig"),
+        pytest.param({"late_s": 1500, "away_m": 1.0}, "", id="whose clocks are set apart"),
+        pytest.param({"away_m": 30.0}, "other places", id="two drones"),
+        pytest.param({"late_s": 1500, "away_m": 1.0, "turns": False}, "the angle between", id="two flights"),
+    ],
+)
+def test_flights_whose_files_have_the_same_names_are_no_rig(tmp_path, second, why):
+    """Each mission counts from 1, and people sort missions by where they look."""
+    fly(tmp_path / "front")
+    fly(tmp_path / "nadir", **second)
+    found = collect_images([tmp_path])
+    assert any(photo.sensor for photo in found.images) == (not why)
+    assert sum("no rig" in note and why in note for note in found.notes) == bool(why)
+
+
+@pytest.mark.parametrize("clock", [lambda k: 3000 + 5 * k, lambda k: 9 * k])
+def test_moments_alone_tell_flights_from_a_rig(tmp_path, clock):
+    """Without places a clock that is set apart is no other than that of a second flight."""
+    for folder, seconds in (("left", lambda k: 5 * k), ("right", clock)):
+        (tmp_path / folder).mkdir()
+        for k in range(6):
+            pixels = np.random.default_rng([k, len(folder)]).integers(0, 255, (120, 160, 3), np.uint8)
+            write_photograph(tmp_path / folder / f"{k:04d}.jpg", pixels, seconds(k), None)
+    found = collect_images([tmp_path])
+    assert not any(photo.sensor for photo in found.images)
+    assert any("other moments" in note for note in found.notes)
+
+
+def test_cameras_of_a_rig_are_found_beside_a_flight_of_its_names(tmp_path):
+    fly(tmp_path / "back", late_s=1500, away_m=40.0)
+    fly(tmp_path / "left")
+    fly(tmp_path / "right", pitch=-45.0)
+    assert {photo.sensor for photo in collect_images([tmp_path]).images} == {"", "left/", "right/"}
 
 
 def matched(workspace: Workspace, poses: dict[str, np.ndarray], points: np.ndarray) -> None:
@@ -78,28 +128,38 @@ def matched(workspace: Workspace, poses: dict[str, np.ndarray], points: np.ndarr
             database.write_two_view_geometry(one, other, geometry)
 
 
-def test_a_rig_is_measured_and_held_together(tmp_path):
-    """Its second camera lies as it truly does, in one frame with the first."""
-    flight = known_flight(strips=2, each=4)
+def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0, mixed: bool = False):
+    """A flight of two cameras, its photographs, the models without rigs and after `map_rigs`, and what is said. The
+    second camera is off its place on the rig by `shaken_m` (standard deviation), or flies in a `mixed` order."""
+    flight, rng, console = known_flight(strips=2, each=4), np.random.default_rng(0), Console(file=io.StringIO())
     names = [f"cam{s}/{k:04d}.jpg" for s in range(2) for k in range(8)]
-    photographs(tmp_path / "photos", names)
-    images = collect_images([tmp_path / "photos"]).images
+    photographs(folder / "photos", names)
+    images = collect_images([folder / "photos"]).images
     images = [type(photo)(**{**vars(photo), "width": 800, "height": 600}) for photo in images]
-    workspace = Workspace(tmp_path / "work")
+    workspace = Workspace(folder / "work")
     create_database(workspace, group_by_camera(images))
-    firsts = {f"cam0/{k:04d}.jpg": pose[:3] for k, pose in enumerate(flight.poses)}
-    seconds = {
-        f"cam1/{name[5:]}": np.hstack([SECOND[:, :3] @ pose[:, :3], SECOND[:, :3] @ pose[:, 3:] + SECOND[:, 3:]])
-        for name, pose in firsts.items()
-    }
-    matched(workspace, firsts | seconds, flight.points)
+    poses = {f"cam0/{k:04d}.jpg": pose[:3] for k, pose in enumerate(flight.poses)}
+    firsts = list(poses.items())
+    for (name, _), number in zip(firsts, rng.permutation(8) if mixed else range(8), strict=True):
+        pose = firsts[number][1]
+        place = SECOND[:, :3] @ pose[:, 3:] + SECOND[:, 3:] + rng.normal(0, shaken_m, (3, 1))
+        poses[f"cam1/{name[5:]}"] = np.hstack([SECOND[:, :3] @ pose[:, :3], place])
+    poses.pop(lost, None)
+    matched(workspace, poses, flight.points)
     workspace.images.mkdir()
     silence_colmap()
     incremental_mapper.run_mapper(workspace, 16, True, 1, CONSOLE)
     incremental_mapper.set_models_aside(workspace)
-    map_rigs(workspace, images, 16, True, 1, CONSOLE)
-    model = incremental_mapper.read_models(workspace)[0]
-    assert (model.num_reg_images(), model.num_reg_frames()) == (16, 8)
+    map_rigs(workspace, images, 16, True, 1, console)
+    loose, model = (incremental_mapper.read_models(workspace, aside)[0] for aside in (True, False))
+    return flight, len(poses), loose, model, " ".join(console.file.getvalue().split())
+
+
+@pytest.mark.parametrize("lost", [pytest.param(None, id="whole"), "cam0/0003.jpg"])
+def test_a_rig_is_measured_and_held_together(tmp_path, lost):
+    """Its second camera lies as it truly does, in one frame with the first, of which a photograph may be lost."""
+    flight, count, _, model, _ = mapped(tmp_path, lost)
+    assert (model.num_reg_images(), model.num_reg_frames()) == (count, 8)
     rig = next(each for each in model.rigs.values() if each.num_sensors() == 2)
     second_from_first = next(iter(rig.non_ref_sensors.values()))
     turned = second_from_first.rotation.matrix()
@@ -110,3 +170,18 @@ def test_a_rig_is_measured_and_held_together(tmp_path):
     scale = true / np.linalg.norm(centers["cam0/0007.jpg"] - centers["cam0/0000.jpg"])
     assert scale * np.linalg.norm(second_from_first.translation) == pytest.approx(5, abs=0.25)
     assert len(describe_rigs(model, "m")) == 1
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        pytest.param({"shaken_m": 0.5}, "px farther off", id="half a metre off"),
+        pytest.param({"mixed": True}, "no two of them are", id="another flight"),
+    ],
+)
+def test_cameras_that_are_not_fixed_to_each_other_are_not_held_together(tmp_path, how, said):
+    """Where COLMAP places all photographs, too, as a rig."""
+    _, _, loose, model, notes = mapped(tmp_path, **how)
+    assert (model.num_reg_images(), model.num_reg_frames()) == (16, 16)
+    assert model.compute_mean_reprojection_error() == loose.compute_mean_reprojection_error()
+    assert said in notes

@@ -157,6 +157,29 @@ def test_masks_turn_with_their_photographs(tmp_path, orientation):
         assert np.array_equal(read_keep_mask(found[0]), truth)
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+def test_tiffs_and_their_masks_are_turned_upright_once(tmp_path, orientation, compression):
+    exif, folder = Image.Exif(), tmp_path / "photos"
+    exif[0x0112] = orientation
+    turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}.get(orientation)
+    for k in range(3):
+        (folder / "masks").mkdir(parents=True, exist_ok=True)
+        for file, picture in (
+            (folder / f"{k}.tif", Image.fromarray(np.roll(NOISE, k, axis=0))),
+            (folder / f"masks/{k}.tif", Image.fromarray(left_half().astype(np.uint8) * 255)),
+        ):
+            stored = picture if turn is None else picture.transpose(turn)
+            stored.save(file, exif=exif, compression=compression)
+    found = collect_images([folder]).images
+    assert [photo.size for photo in found] == [(160, 120)] * 3
+    assert all(np.array_equal(read_keep_mask(photo), left_half()) for photo in found)
+    work = Workspace(tmp_path / "work")
+    assert feature_extraction.write_upright_images(work, found) == []
+    pixels = pycolmap.Bitmap.read(work.images / found[0].name, True).to_array()
+    assert np.array_equal(pixels, NOISE)
+
+
 def test_transparency_is_a_mask_and_both_count(tmp_path):
     for k in range(3):
         alpha = np.where(left_half() | (k == 2), 255, 0).astype(np.uint8)

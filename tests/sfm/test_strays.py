@@ -115,7 +115,8 @@ def test_masks_of_every_scale_keep_the_same(tmp_path, kind):
         ".Trashes/501", ".thumbnails", "@eaDir", "__MACOSX", "$RECYCLE.BIN", "System Volume Information", "thumbnails",
         "Thumbs", "odm_orthophoto", "odm_texturing/x", "opensfm/undistorted/images", "dsm", "orthophoto", "3_dsm_ortho",
         "project.files/0/0", "depth_maps", "renders", ".git/x", "Labels", "gt",
-        "train-label-img", "label_images_semantic", "annotations", "segmentation",
+        "train-label-img", "label_images_semantic", "annotations", "segmentation", "Proxy",
+        "Transcoded Media/Proxy Media",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("tagged", [True, False])
@@ -177,6 +178,45 @@ def test_smaller_copies_in_another_folder_are_left_out(tmp_path):
     found = collect_images([tmp_path])
     assert [photo.name for photo in found.images] == [f"full/{name}" for name in names]
     assert all("smaller copy of full/" in each.reason for each in found.excluded)
+
+
+@pytest.mark.parametrize(("late_s", "east_m"), [(1800, 0.0), (0, 50.0)])
+def test_smaller_photographs_of_another_flight_are_no_copies(tmp_path, late_s, east_m):
+    """Whose files count from 1 again: 48 megapixels, then 12."""
+    for folder, count, size, late, east in (("1", 6, (320, 240), 0, 0.0), ("2", 4, (160, 120), late_s, east_m)):
+        (tmp_path / folder).mkdir()
+        for k in range(count):
+            place = np.array([10.0 * k + east, 0.0, 40.0])
+            write_photograph(tmp_path / folder / f"DJI_{k:04d}.JPG", pixels(k, *size), k + late, place)
+    found = collect_images([tmp_path])
+    assert (len(found.images), found.excluded) == (10, ())
+
+
+def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
+    """Edited or raw; and not what another camera of a rig shows, at the same moments and places."""
+    names = flight(tmp_path / "z")
+    for k, name in enumerate(names):
+        with Image.open(tmp_path / "z" / name) as image:
+            exif, shown = image.getexif(), np.asarray(image)
+        if k < 4:  # brighter, and without contrast in the lights
+            picture(tmp_path / "edited" / name, (255 * (shown / 255) ** 0.6).clip(20, 230).astype(np.uint8), exif=exif)
+        picture(tmp_path / "other camera" / name, pixels(50 + k), exif=exif)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [
+        f"{folder}/{n}" for folder in ("other_camera", "z") for n in names
+    ]
+    assert all(f"another version of z/{each.name[-12:]}" in each.reason for each in found.excluded)
+
+
+def test_raw_files_in_a_folder_beside_their_pictures_are_left_out(tmp_path):
+    pytest.importorskip("rawpy")
+    (tmp_path / "JPG").mkdir()
+    for k in range(4):
+        write_dng(tmp_path / f"DNG/p{k}.dng", pixels(k))
+        write_photograph(tmp_path / f"JPG/p{k}.jpg", pixels(k, 152, 120), 0, np.array([10.0 * k, 0, 40]))
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [f"JPG/p{k}.jpg" for k in range(4)]
+    assert all("another version of JPG/" in each.reason for each in found.excluded)
 
 
 def test_a_photograph_that_lost_its_tags_is_used_as_the_others_of_its_size(tmp_path):

@@ -356,6 +356,27 @@ def test_digital_zoom_is_a_camera_of_its_own_and_counts_once(tmp_path, in_focal_
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("plain", "zoomed", "times"),
+    [
+        pytest.param((8.5, 31), (8.5, 31), 1.5, id="neither has it"),
+        pytest.param((8.5, 31), (12.75, 31), 1.5, id="the focal length has it"),
+        pytest.param((None, 31), (None, 31), 1.5, id="nothing but the equivalent"),
+        pytest.param((8.5, 31), (8.5, 46), 1.0, id="the equivalent has it"),
+        pytest.param((12.75, 46), (8.5, 46), 1.0, id="others are zoomed by their lens"),
+    ],
+)
+def test_an_equivalent_that_lacks_the_digital_zoom_is_told_by_photographs_without(tmp_path, plain, zoomed, times):
+    def seen(k: int, focal_mm: float | None, equivalent: int, zoom: float) -> ImageMetadata:
+        lens = read_lens({}, {0x920A: focal_mm, 0xA405: equivalent, 0xA404: zoom}, {}, 400, 300)
+        return replace(photograph(tmp_path, k), lens=lens)
+
+    found = cross_checked([seen(k, *(zoomed if k % 2 else plain), 1.5 if k % 2 else 1.0) for k in range(6)])
+    focal = zoomed[1] * times * 5 / np.hypot(36, 24) / 4
+    assert [photo.lens.focal for photo in found[1::2]] == pytest.approx([focal] * 3)
+    assert [photo.lens.focal for photo in found[::2]] == pytest.approx([plain[1] * 5 / np.hypot(36, 24) / 4] * 3)
+
+
 @pytest.mark.parametrize("equivalent", [None, 59])
 def test_digital_zoom_of_all_photographs_is_doubted_unless_the_equivalent_has_it(tmp_path, equivalent):
     for k in range(4):

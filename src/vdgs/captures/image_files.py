@@ -25,6 +25,7 @@ from vdgs.captures.name_resolution import find_file
 from vdgs.captures.optional_decoders import has_decoder, prepare_heif
 from vdgs.captures.raw_files import RAW_SUFFIXES, develop, is_raw, raw_size
 from vdgs.captures.strays import is_hidden
+from vdgs.captures.tiff_orientation import stored_size, without_orientation
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
 from vdgs.system.native_messages import without_decoder_messages
@@ -120,7 +121,7 @@ def read_header(path: Path) -> ImageHeader:
             header = ImageHeader(*raw_size(path), "RGB")
         else:
             with open_image(path) as image:
-                header = ImageHeader(image.width, image.height, mode_of(image))
+                header = ImageHeader(*stored_size(image), mode_of(image))
     except CaptureError:
         raise
     except FileNotFoundError:
@@ -263,7 +264,7 @@ def _kept(light: np.ndarray) -> np.ndarray:
 def _decode(path: Path) -> np.ndarray:
     """OpenCV's decoding as stored (BGR order); Pillow where OpenCV cannot."""
     try:
-        data = np.fromfile(path, np.uint8)
+        data = without_orientation(np.fromfile(path, np.uint8))
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
     converted = _converted(path, data)
@@ -279,7 +280,7 @@ def _decode(path: Path) -> np.ndarray:
     if pixels is not None and pixels.ndim in (2, 3) and (pixels.ndim == 2 or pixels.shape[2] in (3, 4)):
         return pixels
     try:
-        with Image.open(path) as image:
+        with Image.open(io.BytesIO(data.tobytes())) as image:
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
     except MemoryError:
         raise

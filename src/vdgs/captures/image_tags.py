@@ -12,6 +12,7 @@ from vdgs.captures.color_profiles import foreign_space
 from vdgs.captures.image_files import mode_of, open_image
 from vdgs.captures.jpeg import JPEGS, has_end
 from vdgs.captures.raw_files import is_raw, raw_size, raw_tags
+from vdgs.captures.tiff_orientation import stored_size
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
@@ -51,9 +52,10 @@ def read_tags(path: Path) -> ImageTags:
         )  # fmt: skip
     with open_image(path) as image:
         kind, exif = _kind(image), image.getexif()  # of a PNG, the latter forgets how its pixels lie
+        width, height = stored_size(image)
         return ImageTags(
-            width=image.width,
-            height=image.height,
+            width=width,
+            height=height,
             mode=mode_of(image),
             tags=dict(exif),
             details=dict(exif.get_ifd(_EXIF_IFD)),

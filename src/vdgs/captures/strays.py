@@ -13,7 +13,7 @@ from vdgs.system.quoting import shell_word
 #: Folders that systems and programs keep for themselves; so are all whose names begin with a dot.
 _HIDDEN = re.compile(
     r"\..*|@.*|#recycle|\$recycle\.bin|__macosx|system volume information|lost\+found|_?thumb(nail)?s?|_?previews?"
-    r"|thumbs?_.*|proxies|cache|__pycache__",
+    r"|thumbs?_.*|prox(y|ies)( media)?|cache|__pycache__",
     re.IGNORECASE,
 )
 #: Folders of what programs made of photographs: ODM, OpenSfM, COLMAP, Pix4D, Metashape, and their maps; and of what

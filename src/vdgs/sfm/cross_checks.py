@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import PurePosixPath
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from vdgs.captures.image_files import open_image, same_aspect
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
-from vdgs.sfm.focal_length import Lens, unzoomed
+from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
 #: Focal lengths within this share of each other are one.
@@ -40,11 +40,18 @@ _COPY_NAME = re.compile(
     re.IGNORECASE,
 )
 _SAME_MOMENT = timedelta(seconds=2)
+#: Programs that convert photographs may round places by so much (about a metre; choice).
+_ROUNDED_DEG = 1e-5
+#: Exposures that differ by fewer stops are one, as EXIF rounds them.
+SAME_STOPS = 0.2
 #: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
 _PREFERRED = ("panchro", "green", "red", "blue")
 #: Fewer color photographs than this share of the exposures are none of the set.
 _COLOR_SHARE = 0.5
 _FLAT = "that the receiver measured no altitude (GPSMeasureMode 2)"
+#: Photographs show the same where the order of the gray values of their pixels correlates so well, by so many of them
+#: (choice; five aerial photographs and themselves moved by 2 % of the width: 0.54 to 0.92).
+SAME_PICTURE, LOOKED_AT_PAIRS = 0.95, 3
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)
 
@@ -95,8 +102,24 @@ def _zoom_once(group: list[ImageMetadata]) -> list[ImageMetadata]:
                 photo = replace(photo, lens=unzoomed(lens))
             elif not whole and not lens.zoom_confirmed and lens.zoom > 1 + ONE_FOCAL:
                 photo = _doubted(photo, lens)
+        elif lens is not None and _lacks_zoom(lens, group):
+            doubt = "the 35 mm equivalent is that of photographs without digital zoom; multiplied by DigitalZoomRatio"
+            photo = replace(photo, lens=zoomed(lens), doubts=(*photo.doubts, doubt))
         found.append(photo)
     return found
+
+
+def _lacks_zoom(lens: Lens, group: list[ImageMetadata]) -> bool:
+    """Whether the 35 mm equivalent that a focal length is from lacks the digital zoom: others of the camera say the
+    same without zoom, and none says what would be left without it."""
+    zoom, focal_mm = lens.digital_zoom, lens.focal_mm or 0.0
+    if lens.source != EQUIVALENT or zoom <= 1 + ONE_FOCAL:
+        return False
+    others = [each.lens for each in group if each.lens and each.lens.digital_zoom == 1]
+    others = [each for each in others if any(_near_or_none(each.focal_mm, mm) for mm in (focal_mm, focal_mm / zoom))]
+    return any(_near(each.focal, lens.focal) for each in others) and not any(
+        _near(each.focal, lens.focal / zoom) for each in others
+    )
 
 
 def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
@@ -131,6 +154,10 @@ def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
 
 def _near(one: float, other: float) -> bool:
     return abs(one / other - 1) < ONE_FOCAL
+
+
+def _near_or_none(one: float | None, other: float) -> bool:
+    return not one or not other or _near(one, other)
 
 
 def _one_altitude(group: list[ImageMetadata]) -> list[ImageMetadata]:
@@ -177,6 +204,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     A picture without any tags is a stray only where most others have them.
     """
     reasons = _smaller_copies(photographs) | _other_cameras(photographs) | _later_copies(photographs)
+    reasons |= _versions_elsewhere([photo for photo in photographs if photo.name not in reasons])
     tagged = [photo for photo in photographs if not is_bare(photo)]
     bare = [photo for photo in photographs if is_bare(photo) and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()
@@ -229,18 +257,34 @@ def _other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     return found
 
 
+def taken_apart(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether two photographs were taken at other moments or places, as far as both say it."""
+    moments, places = (photo.datetime, other.datetime), (photo.lat_lon, other.lat_lon)
+    apart = all(moments) and moments[0] != moments[1]
+    if places[0] is not None and places[1] is not None:
+        apart |= bool(np.abs(np.subtract(places[0], places[1])).max() > _ROUNDED_DEG)
+    return apart
+
+
 def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
-    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder."""
+    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder, and not of another
+    flight, whose files count from 1 again."""
     stems: dict[str, list[ImageMetadata]] = {}
     for photo in photographs:
         stems.setdefault(PurePosixPath(photo.name).stem.lower(), []).append(photo)
     usual = Counter(photo.size for photo in photographs).most_common(1)[0][0] if photographs else (0, 0)
     reasons = {}
     for alike in stems.values():
-        largest = max(alike, key=lambda photo: photo.width * photo.height)
         for photo in alike:
-            small = max(photo.size) <= SMALLER * max(largest.size) and photo.size != usual
-            if small and same_aspect(photo.size, largest.size):
+            larger = [
+                other
+                for other in alike
+                if max(photo.size) <= SMALLER * max(other.size)
+                and same_aspect(photo.size, other.size)
+                and not taken_apart(photo, other)
+            ]
+            if larger and photo.size != usual:
+                largest = max(larger, key=lambda other: other.width * other.height)
                 reasons[photo.name] = f"is a smaller copy of {largest.name}"
     return reasons
 
@@ -257,6 +301,68 @@ def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
         if (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon):
             found[photo.name] = f"is a copy or another version of {first.name}, by its name, moment and place"
     return found
+
+
+def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Photographs that another folder has too, edited or as raw files: of one name, moment, place and shape, and they
+    show the same. The folder of more photographs is used. Cameras of a rig share names, moments and places, too, and
+    show something else."""
+    folders: dict[str, dict[str, ImageMetadata]] = {}
+    for photo in photographs:
+        path = PurePosixPath(photo.name)
+        folders.setdefault(str(path.parent), {})[path.stem.lower()] = photo
+    found, kept = dict[str, str](), list[dict[str, ImageMetadata]]()
+    for folder in sorted(folders, key=lambda each: (_are_raw(folders[each]), -len(folders[each]), len(each), each)):
+        for other in kept:
+            shared = sorted(folders[folder].keys() & other.keys())
+            pairs = [(other[stem], folders[folder][stem]) for stem in shared]
+            pairs = [(one, photo) for one, photo in pairs if one.name not in found and _is_one_exposure(one, photo)]
+            if pairs and _show_the_same(pairs):
+                for one, photo in pairs:
+                    found[photo.name] = (
+                        f"is another version of {one.name}, by its name, moment, place and what it shows"
+                    )
+        kept.append(folders[folder])
+    return found
+
+
+def _are_raw(folder: Mapping[str, ImageMetadata]) -> bool:
+    return all(photo.kind == "raw" for photo in folder.values())
+
+
+def _is_one_exposure(one: ImageMetadata, other: ImageMetadata) -> bool:
+    known = bool(one.datetime and other.datetime) and not taken_apart(one, other)
+    stops = one.exposure_stops, other.exposure_stops
+    if stops[0] is not None and stops[1] is not None:  # of a bracket whose exposures were sorted into folders?
+        known &= abs(stops[0] - stops[1]) < SAME_STOPS
+    return known and ("raw" in (one.kind, other.kind) or same_aspect(one.size, other.size))
+
+
+def _show_the_same(pairs: Sequence[tuple[ImageMetadata, ImageMetadata]]) -> bool:
+    """Whether the photographs of each pair show the same in any brightness and contrast, by a few of them. A raw file
+    and a picture of one exposure do."""
+    chosen = [pairs[k] for k in sorted({len(pairs) * part // LOOKED_AT_PAIRS for part in range(LOOKED_AT_PAIRS)})]
+    for one, other in chosen:
+        if (one.kind == "raw") == (other.kind == "raw"):
+            ranks = _gray_ranks(one), _gray_ranks(other)
+            if not all(np.any(each) for each in ranks) or np.corrcoef(ranks)[0, 1] < SAME_PICTURE:
+                return False
+    return True
+
+
+def _gray_ranks(photo: ImageMetadata) -> np.ndarray:
+    """Which place each pixel [n] of a small upright picture has by its brightness, from the middle one; zeros for a
+    picture of one gray value, and for one that Pillow does not read."""
+    try:
+        with open_image(photo.path) as image:
+            image.draft("L", (2 * _LOOKED_AT[0], 2 * _LOOKED_AT[1]))
+            small = ImageOps.exif_transpose(image).convert("L").resize(_LOOKED_AT, Image.Resampling.BOX)
+            gray = np.asarray(small).ravel()
+    except (OSError, SyntaxError, ValueError):
+        return np.zeros(_LOOKED_AT[0] * _LOOKED_AT[1])
+    ordered = np.sort(gray)
+    ranks = np.searchsorted(ordered, gray) + np.searchsorted(ordered, gray, side="right")
+    return np.asarray(ranks - ranks.mean())
 
 
 def is_black_and_white(photo: ImageMetadata) -> bool:

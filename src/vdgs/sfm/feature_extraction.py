@@ -136,17 +136,20 @@ def write_upright_images(
 
 
 def _write_upright(photo: ImageMetadata, target: Path) -> None:
+    if photo.path.suffix.lower() not in _JPEGS:
+        upright = np.ascontiguousarray(apply_orientation(decode_image(photo.path)[0], photo.orientation))
+        kind = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}.get(target.suffix.lower(), "JPEG")
+        _save(Image.fromarray(upright), target, kind)
+        return
     with pillow_without_limits(), Image.open(photo.path if photo.whole else with_end(photo.path)) as image:
-        upright = ImageOps.exif_transpose(image).convert("RGB")
-    kind = (
-        "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"
-    )
-    _save(upright, target, kind)
+        _save(ImageOps.exif_transpose(image).convert("RGB"), target, "JPEG")
 
 
 def _save(upright: Image.Image, target: Path, kind: str) -> None:
+    options = {"quality": _UPRIGHT_QUALITY, "subsampling": 0} if kind == "JPEG" else {}
+
     def write(file: Path) -> None:
-        upright.save(file, kind, quality=_UPRIGHT_QUALITY, subsampling=0)
+        upright.save(file, kind, **options)
 
     write_atomic(target, write)
 

@@ -9,11 +9,13 @@ from typing import Any
 
 from vdgs.sfm.xmp import first_number, text
 
-#: Width in millimetres of the sensors of cameras that do not say it in EXIF, by EXIF's model.
-SENSOR_WIDTH_MM = {
-    "FC300S": 6.17, "FC300X": 6.17, "FC300C": 6.17, "FC330": 6.17, "FC220": 6.17, "FC350": 6.17, "FC2103": 6.17,
-    "FC550": 17.3, "FC6310": 13.2, "FC6310S": 13.2, "FC6310R": 13.2, "L1D-20C": 13.2, "FC3411": 13.2,
-}  # fmt: skip
+#: Sensors in millimetres across and down, of cameras that do not say it in EXIF, by EXIF's model.
+_SMALL, _ONE_INCH, _FOUR_THIRDS = (6.17, 4.55), (13.2, 8.8), (17.3, 13.0)
+SENSOR_MM = {
+    **dict.fromkeys(("FC300S", "FC300X", "FC300C", "FC330", "FC220", "FC350", "FC2103"), _SMALL),
+    **dict.fromkeys(("FC6310", "FC6310S", "FC6310R", "L1D-20C", "FC3411"), _ONE_INCH),
+    "FC550": _FOUR_THIRDS,
+}
 #: Half the diagonal's meaning of "35 mm equivalent": that of a 36 x 24 mm picture.
 DIAGONAL_35_MM = math.hypot(36, 24)
 #: Wider pictures than this are cut from a sensor of 4 x 3 (films' shape, on drones).
@@ -50,6 +52,8 @@ class Lens:
     """What contradicts it; a focal length that is doubted is fitted."""
     zoom: float = 1.0
     """The digital zoom that `focal` is multiplied by."""
+    digital_zoom: float = 1.0
+    """EXIF's DigitalZoomRatio, which the 35 mm equivalent contains as a rule."""
     focal_mm: float | None = None
     """EXIF's FocalLength."""
     zoom_confirmed: bool = False
@@ -70,13 +74,13 @@ def read_lens(
     model, zoom = _model(tags), _zoom(details)
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
     kept = zoom * (original / longer if cut else 1.0)  # a picture that was cut has fewer pixels, of the same size
+    sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
     measured = [
         (_times(_calibrated(xmp, original), kept), CALIBRATED_SOURCE),
         (_times(_by_sensor(focal_mm, _sensor(details, original)), kept), SENSOR),
-        (_times(_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), kept), f"EXIF's focal length, the sensor of {model}"),
+        (_times(_by_sensor(focal_mm, _used_width(model, *sides)), kept), f"EXIF's focal length, the sensor of {model}"),
         (_times(_by_pix4d(xmp, _sensor(details, original), original), kept), PIX4D_SOURCE),
     ]
-    sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
     equivalent = as_written = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
     equivalent = _zoomed_equivalent(equivalent, [focal for focal, _ in measured], zoom)
     ways = [*measured, (equivalent, EQUIVALENT)]
@@ -87,13 +91,18 @@ def read_lens(
     confirmed = as_written is not None and _alike(as_written, focal) and not _alike(as_written, focal / zoom)
     if unclear and not cut:
         doubt = "; ".join(filter(None, (unclear, doubt)))
-    zoom = 1.0 if source == EQUIVALENT else zoom
-    return Lens(focal, source, doubt, zoom, focal_mm, confirmed, remark=unclear if cut else "")
+    counted = 1.0 if source == EQUIVALENT else zoom
+    return Lens(focal, source, doubt, counted, zoom, focal_mm, confirmed, remark=unclear if cut else "")
 
 
 def unzoomed(lens: Lens) -> Lens:
     """The lens where EXIF's focal length has the digital zoom in it already."""
     return replace(lens, focal=lens.focal / lens.zoom, zoom=1.0)
+
+
+def zoomed(lens: Lens) -> Lens:
+    """The lens where the 35 mm equivalent lacks the digital zoom."""
+    return replace(lens, focal=lens.focal * lens.digital_zoom, zoom=lens.digital_zoom)
 
 
 def _agreed(known: list[tuple[float, str]], longer: int, copied: bool) -> tuple[float, str, str]:
@@ -221,6 +230,16 @@ def _sensor(details: Mapping[int, Any], original: float) -> float | None:
     """Width of the sensor in millimetres, from EXIF's pixels per inch (centimetre, millimetre) on it."""
     density, unit = _number(details.get(0xA20E)), details.get(0xA210, 2)
     return original / density * _UNITS[unit] if density and unit in _UNITS else None
+
+
+def _used_width(model: str, width: float, height: float) -> float | None:
+    """Of a known sensor, the longer side in millimetres that a camera takes for pictures of a shape: a picture that is
+    less wide than the sensor has its whole height."""
+    if model not in SENSOR_MM:
+        return None
+    across, down = SENSOR_MM[model]
+    used = down * max(width, height) / min(width, height)
+    return used if used < (1 - CUT) * across else across
 
 
 def _by_sensor(focal_mm: float | None, sensor_mm: float | None) -> float | None:

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 
-import numpy as np
-
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import HEIF_SUFFIXES, IMAGE_SUFFIXES
@@ -23,7 +21,7 @@ from vdgs.captures.strays import check_no_run, walk
 from vdgs.config.sfm_options import Brackets, CameraModel
 from vdgs.errors import CaptureError
 from vdgs.sfm.brackets import unused_exposures
-from vdgs.sfm.cross_checks import cross_checked, strays, unused_bands
+from vdgs.sfm.cross_checks import cross_checked, strays, taken_apart, unused_bands
 from vdgs.sfm.find_images import check_decoders, find_files, is_dangling, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
@@ -36,8 +34,6 @@ from vdgs.system.units import first_names
 MIN_IMAGES = 3
 #: So many bytes at both ends of files of one size tell whether they are copies.
 _DIGEST_BYTES = 1 << 16
-#: Programs that convert photographs may round places by so much (about a metre; choice).
-_ROUNDED_DEG = 1e-5
 
 
 @dataclass(frozen=True)
@@ -237,12 +233,8 @@ def _why_same(photo: ImageMetadata, other: ImageMetadata) -> str:
             f"has the name of {other.name} but for upper and lower case, which many disks do not tell apart: rename "
             "one of the two to use both"
         )
-    moments, places = (photo.datetime, other.datetime), (photo.lat_lon, other.lat_lon)
-    apart = all(moments) and moments[0] != moments[1]
-    if places[0] is not None and places[1] is not None:
-        apart |= bool(np.abs(np.subtract(places[0], places[1])).max() > _ROUNDED_DEG)
     one_mask = photo.mask is not None and photo.mask == other.mask  # which of the two is it of?
-    return "" if apart and not one_mask else f"has the name of {other.name} with another ending"
+    return "" if taken_apart(photo, other) and not one_mask else f"has the name of {other.name} with another ending"
 
 
 def _digest(path: Path) -> bytes:

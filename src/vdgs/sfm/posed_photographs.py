@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +19,7 @@ from vdgs.captures.image_files import pillow_without_limits, read_header
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.image_tags import kind_of
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST, held_out_by_capture
+from vdgs.captures.tiff_orientation import without_orientation
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError
@@ -180,7 +182,8 @@ def write_on_white(photographs: PosedPhotographs, work: Workspace) -> None:
         target = work.images / view.view.name
         if target.exists() or not _has_alpha(view):
             continue
-        with pillow_without_limits(), Image.open(view.file.path) as image:
+        stored = without_orientation(np.fromfile(view.file.path, np.uint8)).tobytes()
+        with pillow_without_limits(), Image.open(io.BytesIO(stored)) as image:
             pixels = np.asarray(image.convert("RGBA")).astype(np.float32)
         alpha = pixels[..., 3:] / 255
         flat = (pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5).astype(np.uint8)

@@ -19,6 +19,7 @@ from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_points, tilt_from_attitudes
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
+from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.incremental_mapper import refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -28,6 +29,9 @@ from vdgs.system.lazy_pycolmap import pycolmap
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 MAX_TILT_DEG = 3.0
+#: Views that look less down than this (degrees from straight down; median) show walls: the height of the median point
+#: is not that of the ground (choice).
+LEVEL_TILT_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,7 +68,11 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, collection.images) if metric else None
-    warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
+    warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned, tilt)]
+    if placed is not None and height is not None:
+        up = placed.residuals[:, 2]
+        names = [collection.images[int(positions.image_indices[row])].name for row in placed.position_rows]
+        warnings += _lens_warnings(collection.images, dict(zip(names, up.tolist(), strict=True)), height)
     warnings += _survey_warnings(result.found.survey)
     if any(photo.sensor for photo in collection.images):
         warnings += describe_rigs(model, "m" if metric else "units of the model")
@@ -199,7 +207,12 @@ def _photographs(
 
 
 def _warnings(
-    cameras: Sequence[CameraReport], held: bool, height: float | None, recorded: float | None, turned: float | None
+    cameras: Sequence[CameraReport],
+    held: bool,
+    height: float | None,
+    recorded: float | None,
+    turned: float | None,
+    tilt: float | None,
 ) -> list[str]:
     found = []
     for camera in cameras:
@@ -209,13 +222,36 @@ def _warnings(
                 f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if "
                 "heights look wrong, hold it: --focal fixed"
             )
-    if height is not None and recorded is not None and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
+    sees_ground = tilt is not None and tilt < LEVEL_TILT_DEG
+    if sees_ground and height is not None and recorded and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
         found.append(
             f"the cameras are {height:.1f} m over the median point, the drone recorded {recorded:.1f} m over its "
             "take-off: another level of ground, or a focal length that is not right."
         )
     if turned is not None and turned > MAX_TILT_DEG:
         found.append(f"down differs by {turned:.1f}° from what the drone recorded: the model may be tilted or bent.")
+    return found
+
+
+def _lens_warnings(photographs: Sequence[ImageMetadata], off_m: Mapping[str, float], height: float) -> list[str]:
+    """Of photographs of one camera that say another focal length than most, and come out at another height than their
+    positions have (metres above these, by name): a wrong tag does that where the focal length is held."""
+    cameras: dict[tuple[str, tuple[int, int]], dict[float, list[float]]] = {}
+    for photo in photographs:
+        if photo.lens is not None and photo.name in off_m:
+            lenses = cameras.setdefault((photo.camera, photo.size), {})
+            lenses.setdefault(round(photo.lens.focal * max(photo.size)), []).append(off_m[photo.name])
+    found = []
+    for (camera, _), lenses in cameras.items():
+        usual = max(lenses, key=lambda focal: len(lenses[focal]))
+        for focal, offs in lenses.items():
+            away = float(np.median(offs) - np.median(lenses[usual]))
+            if focal != usual and len(offs) > 1 and abs(away) > MAX_HEIGHT_DRIFT * height:
+                found.append(
+                    f"{camera}: the {len(offs)} photographs with a focal length of {focal} px come out "
+                    f"{abs(away):.1f} m {'higher' if away > 0 else 'lower'} than their positions say, compared with "
+                    f"those with {usual} px. Is EXIF's FocalLength of these right? Mend it, or leave them out."
+                )
     return found
 
 

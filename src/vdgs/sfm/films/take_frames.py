@@ -217,12 +217,14 @@ def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: 
             last = _look(film, chooser, tell)
         chosen = chooser.finish()
         records, source = film.telemetry()
+        placed = 0
         for file in chosen:
             known = telemetry_at(records, moments[file])
+            placed += known.lat_lon is not None
             moment = _moment(film, records, known, moments[file])
             write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
             os.utime(file, ns=(stat.st_mtime_ns, stat.st_mtime_ns))  # frames that are taken again are no others
-        summary = _summary(film, len(chosen), last, records, source)
+        summary = _summary(film, len(chosen), placed, last, records, source)
     return FilmRecord(
         film=str(path.resolve()), file_bytes=stat.st_size, mtime_ns=stat.st_mtime_ns, most=most, frames=len(chosen),
         summary=summary,
@@ -251,13 +253,16 @@ def _moment(film: Film, records: Sequence[Telemetry], known: Telemetry, seconds:
     return film.created and film.created + timedelta(seconds=seconds)
 
 
-def _summary(film: Film, count: int, last: FilmFrame, records: Sequence[Telemetry], source: str) -> str:
+def _summary(film: Film, count: int, placed: int, last: FilmFrame, records: Sequence[Telemetry], source: str) -> str:
     """96 of 2,400 frames of 1 min 20 s, 3840 x 2160; positions of its subtitles."""
     size = f"{film.stream.width} x {film.stream.height}"
-    placed = len(list(places(records)))
-    said = f"positions of {source}" if placed else "no positions"
-    if not placed:
+    said = f"positions of {source}" + (f" for {placed} of the frames" if placed < count else "")
+    if not any(places(records)):
+        said = "no positions"
         said += " (drones write them into subtitles where captions are switched on; or give a table with --gps)"
+    elif not placed:
+        said = f"no positions: those of {source} are of other times ({duration(records[0].seconds)} to "
+        said += f"{duration(records[-1].seconds)}); the subtitles of another film?"
     notes = [said, *film.notes]
     if film.damaged:
         notes.append(f"{film.damaged} packets are damaged, their frames left out")

@@ -17,6 +17,8 @@ from vdgs.captures.angles import LIMITS, side_of
 
 #: Between records that are farther apart than this (seconds) nothing is known.
 MAX_GAP_S = 3.0
+#: Before the first record and after the last these count for so many seconds: as far as firmwares' records are apart.
+MAX_OUTSIDE_S = 1.0
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _TAGS = re.compile(r"<[^>]{0,200}>")
@@ -88,7 +90,8 @@ def telemetry_at(records: Sequence[Telemetry], seconds: float) -> Telemetry:
         return Telemetry(seconds=seconds)
     after = bisect_right([record.seconds for record in records], seconds)
     one, other = records[max(0, after - 1)], records[min(after, len(records) - 1)]
-    if abs(one.seconds - seconds) > MAX_GAP_S:
+    outside = max(records[0].seconds - seconds, seconds - records[-1].seconds)
+    if abs(one.seconds - seconds) > MAX_GAP_S or outside > MAX_OUTSIDE_S:
         return Telemetry(seconds=seconds)
     span = other.seconds - one.seconds
     share = (seconds - one.seconds) / span if 0 < span <= MAX_GAP_S else 0.0
