@@ -64,6 +64,14 @@ def test_one_photograph_of_each_bracket_is_used_and_the_others_are_named(tmp_pat
     assert len(collect_images([tmp_path], brackets="all").images) == 9
 
 
+def test_exposures_that_were_sorted_into_folders_by_one_name_are_no_versions_of_each_other(tmp_path):
+    for k in range(6):
+        for folder, seconds in (("a", 0.01), ("b", 0.02)):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            tagged(tmp_path / folder / f"p{k}.jpg", k, 15 * k, {0x829A: seconds, 0x8827: 200}, {})
+    assert len(collect_images([tmp_path], brackets="all").images) == 12
+
+
 def test_brackets_of_five_of_lost_exposures_and_of_manual_cameras_are_found(first):
     five = shots(first, [0, -0.7, 0.7, -1.3, 1.3] * 4, each=5)
     assert len(unused_exposures(five)[0]) == 16
