@@ -3,14 +3,21 @@
 import json
 import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from support.clusters import COARSE, KILLED, alive, copy_run, evaluated, merge_run
 from support.commands import begun, do_tasks_here, python, vdgs, wait_until
+from support.hand_made_models import quadrants
+from vdgs.config.method import AssignmentConfig
+from vdgs.evaluation.evaluate_run import make_renderable_model
 from vdgs.evaluation.measured_as import is_evaluated
+from vdgs.partition.assignment.score_matrix import compute_score_matrix
+from vdgs.runs.open_run import OpenedRun, open_run
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("shards")]  # one worker, which trains once
@@ -82,10 +89,34 @@ def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut
     assert loss["psnr"] == pytest.approx(figures["psnr_reference_exposure"], abs=1e-9)
     assert loss["ssim"] == pytest.approx(figures["ssim_reference_exposure"], abs=1e-9)
     assert abs(loss["psnr_baked"] - loss["psnr"]) < 0.5
+    for command in (("lod", run, "--model", "coarse"), ("eval", run, "--lod-error", "0")):
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr + done.stdout
+    of_tree = json.loads((measured.with_name("evaluation_lod_0") / "metrics.json").read_text())
+    assert of_tree["psnr"] == pytest.approx(figures["psnr_reference_exposure"], abs=1e-9)
+    assert of_tree["psnr_reference_exposure"] is None
+    assert_exposures_depart_from_one_exposure_for_all(open_run(run, "coarse"))
     done = vdgs("eval", run, "--views", "training")
     assert done.returncode == 0, done.stderr + done.stdout
     of_training = json.loads((measured.with_name("evaluation_training") / "metrics.json").read_text())
     assert "in the exposure that was fitted to each" in " ".join(of_training["notes"])
+
+
+def assert_exposures_depart_from_one_exposure_for_all(opened: OpenedRun) -> None:
+    """What is compared with photographs, and what chooses cameras, does not see the local exposure of the model."""
+    without = replace(opened, model=opened.model.without_local_exposure())
+    assert opened.model.local_exposure is not None
+    local, plain = (make_renderable_model(run, run, "test") for run in (opened, without))
+    view = opened.capture.test_views[0]
+    assert torch.equal(local.render(view.camera).image, plain.render(view.camera).image)
+    assert torch.equal(local.exposure(view), plain.exposure(view))
+    assert plain.render_neutral is None
+    assert not torch.equal(local.render_neutral(view.camera).image, plain.render(view.camera).image)
+    cameras, blocks = [each.camera for each in opened.capture.train_views[:2]], quadrants(core=1e3)
+    scores = [
+        compute_score_matrix(run.model, blocks, cameras, AssignmentConfig(mode="paper")) for run in (opened, without)
+    ]
+    assert np.array_equal(scores[0].scores, scores[1].scores)
 
 
 def test_whatever_is_stopped_or_killed_views_that_were_measured_are_not_measured_again(merged, measured, tmp_path):

@@ -51,20 +51,27 @@ def test_between_nodes_it_is_bilinear_and_beyond_the_grid_that_of_the_border():
     assert GRID.at(places[:0]).shape == (12, 0)
 
 
-def test_the_bits_of_a_place_do_not_depend_on_the_places_beside_it():
-    g = torch.Generator().manual_seed(0)
-    places, colors = 3 * torch.rand(1003, 3, generator=g), torch.rand(1003, 3, generator=g)
-    some = torch.randperm(1003, generator=g)[:77]
-    assert torch.equal(GRID.at(places)[:, some], GRID.at(places[some]))
-    drawn = apply_departures(colors, GRID.at(places), torch.arange(1003))
-    assert torch.equal(drawn[some], apply_departures(colors[some], GRID.at(places), some))
+def test_the_bits_of_a_place_depend_neither_on_the_places_beside_it_nor_on_threads():
+    g, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
+    places, colors = 3 * torch.rand(100_003, 3, generator=g), torch.rand(100_003, 3, generator=g)
+    some = torch.randperm(100_003, generator=g)[:77]
+    drawn = []
+    try:
+        for count in (1, 4):  # torch parts so many values among threads
+            torch.set_num_threads(count)
+            drawn.append(apply_departures(colors, GRID.at(places), torch.arange(100_003)))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*drawn)
+    assert torch.equal(drawn[0][some], apply_departures(colors[some], GRID.at(places[some]), torch.arange(77)))
 
 
 def test_what_all_photographs_depart_by_holds_everywhere_as_their_exposure():
     cameras = [camera_above(x, 0.0) for x in (-2.0, 0.0, 2.0)]
-    positions = torch.randn(300, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([3.0, 2.0, 0.1])
+    positions = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 0.1])
+    positions -= torch.tensor([3.0, 2.0, 0.0])
     found = fit_local_exposure(ONE.expand(3, 3, 4), colors_of(3), cameras, positions)
-    assert torch.allclose(each_of(found.at(positions)), ONE.expand(300, 3, 4), atol=1e-6)
+    assert torch.allclose(each_of(found.at(positions)), ONE.expand(300, 3, 4), atol=1e-3)
     picture = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(1))
     exposed = apply_exposure(picture, exposure_matrix(ONE[None], 0))
     drawn = apply_departures(picture.flatten(0, 1), ONE.view(12, 1), torch.zeros(20, dtype=torch.long))
@@ -84,19 +91,42 @@ def test_a_place_follows_the_photographs_that_show_it():
     assert shares[2] < -0.4
 
 
+def test_photographs_far_away_change_nothing():
+    """A place is as bright as its own photographs, in a capture of 361 of them and in one of 1369."""
+    found = []
+    for side in (9, 18):
+        steps = np.arange(-side, side + 1) * 0.4 * 4 * 32 / 60  # four tenths of what a photograph shows to each side
+        cameras = [camera_above(x, y) for x in steps for y in steps]
+        near = torch.tensor([abs(c.position[0]) < 4 and abs(c.position[1]) < 4 for c in cameras])
+        departures = torch.where(near[:, None, None], ONE, torch.zeros(3, 4))
+        positions = torch.tensor([[x, y, 0.0] for x in steps[::2] for y in steps[::2]], dtype=torch.float32)
+        moments = colors_of(1).expand(len(cameras), 4, 4)
+        found.append(each_of(fit_local_exposure(departures, moments, cameras, positions).at(torch.zeros(1, 3)))[0])
+    assert torch.allclose(found[0], found[1], atol=0.02 * float(ONE.abs().max()))
+    assert (found[1] * ONE).sum() > 0.8 * ONE.square().sum()
+
+
 def test_photographs_that_look_away_do_not_count():
     away = camera_above(0.0, 0.0, altitude=-4.0)  # below the ground, looking down
     positions = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
     found = fit_local_exposure(torch.stack([ONE, 5 * ONE]), colors_of(2), [camera_above(0.0, 0.0), away], positions)
-    assert torch.allclose(each_of(found.at(positions)), ONE.expand(50, 3, 4), atol=1e-6)
+    assert torch.allclose(each_of(found.at(positions)), ONE.expand(50, 3, 4), atol=1e-3)
     assert not fit_local_exposure(ONE[None], colors_of(1), [away], positions).departures.any()
 
 
-@pytest.mark.parametrize("positions", [np.zeros((1, 3)), np.full((4, 3), 2.5), np.c_[np.arange(9.0), np.zeros((9, 2))]])
+@pytest.mark.parametrize(
+    "positions",
+    [
+        np.zeros((1, 3)),
+        np.array([[0.0, 0, 0], [3, 1, 0]]),
+        np.full((4, 3), 0.4),
+        np.c_[np.arange(9.0), np.zeros((9, 2))],
+    ],
+)
 def test_scenes_without_extent_have_one_too(positions: np.ndarray):
     found = fit_local_exposure(ONE[None], colors_of(1), [camera_above(2.0, 0.5)], torch.from_numpy(positions).float())
     found.check()
-    assert torch.allclose(each_of(found.at(torch.zeros(1, 3))), ONE[None], atol=1e-6)
+    assert torch.allclose(each_of(found.at(torch.zeros(1, 3))), ONE[None], atol=1e-3)
 
 
 def test_pictures_and_files_have_its_colors_and_nothing_else_changes():

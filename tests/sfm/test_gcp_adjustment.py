@@ -328,7 +328,7 @@ def test_a_place_is_no_better_known_than_by_what_a_model_leaves_of_its_points():
     left = np.tile([[0.003, 0.004, 0.011], [-0.003, -0.004, np.nan]], (5, 1))[:9]
     across, up = no_better_than_left(stated, left).place_m
     assert across == pytest.approx(2.306 * 0.005 / 3, rel=1e-3)  # Student's t of eight
-    assert up == pytest.approx(2.306 * 0.011 * np.sqrt(5 / 9) / 3, rel=1e-3)
+    assert up == pytest.approx(2.776 * 0.011 / np.sqrt(5), rel=1e-3)  # of the five that have heights
     worse = replace(stated, place_m=(0.5, 0.6))
     assert no_better_than_left(worse, left) == worse
     assert no_better_than_left(replace(stated, place_m=None), left).place_m is None

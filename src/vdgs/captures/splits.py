@@ -177,9 +177,8 @@ def listed_photographs(
     lines = _names_in_json(file, text) if file.suffix.lower() == ".json" else text.splitlines()
     wanted = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if some and not wanted:
-        raise CaptureError(
-            f"{file}: names no photograph. Write one image name a line, or ignore lists with --split every."
-        )
+        how = "Name images in the list under test" if file.suffix.lower() == ".json" else "Write one image name a line"
+        raise CaptureError(f"{file}: names no photograph. {how}, or ignore lists with --split every.")
     return find_listed(wanted, names, str(file), strict=strict)
 
 

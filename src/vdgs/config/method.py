@@ -336,9 +336,9 @@ class MergeConfig:
     """Whose anchors stay at a position: `owner`: those of the block with the nearest core. `max-visibility`: those of
     the block whose cameras see it most, among those that reach it (needs --block.margin ramp or free)."""
     reference_exposure: Literal["local", "global"] = "local"
-    """In which exposure a scene is drawn, exported and mapped, where exposures were fitted: `local`: that which
-    photographs of a place have in the mean, smoothly; `global`: one for all. `vdgs merge RUN --reference-exposure`
-    changes it in seconds."""
+    """The exposure of pictures, maps and files of a scene, where exposures were fitted: `local`: the mean of the
+    photographs that show a place, which changes smoothly; `global`: one for all. `vdgs merge RUN --reference-exposure`
+    changes it without training. The coarse model always has `local`."""
 
 
 @dataclass(frozen=True)

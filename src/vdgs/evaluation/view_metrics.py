@@ -112,8 +112,9 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewMetrics:
         **dict.fromkeys((*CORRECTED_KEYS, *AFFINE_KEYS)),
     }
     if exposure is not None:
-        in_neutral = inputs.model.render_neutral
-        neutral = plain if in_neutral is None else _render(view, inputs.model, in_neutral)[0]
+        neutral = plain
+        if inputs.model.render_neutral is not None:
+            neutral, seconds = _render(view, inputs.model, inputs.model.render_neutral)
         row |= _compare(metrics.to_8bit(neutral.image), reference, mask, "_reference_exposure")[0]
     if settings.color_correction:
         correction = correct_colors(image, reference, mask)

@@ -2,13 +2,14 @@
 
 Training draws the scene as one exposure for all would show it, and photographs depart from that
 (`model.exposure`): where a cloud passed, or fields are bright, all photographs of a place are darker or brighter
-together. Pictures, maps and files of the scene follow them here, smoothly, from the departures D_i of photographs:
+together. Pictures, maps and files of the scene follow them here, smoothly:
 
-    D(p) = (Σ w_i(p) D_i S_i) (Σ w_i(p) S_i)⁻¹,    w_i(p) = 1 / (1 + a² + b²),
+    D(p) = (Σ w_i(p) D_i S_i) (Σ w_i(p) S_i + w S)⁻¹,    w_i(p) = (1 - (a² + b²) / R²)² up to a² + b² = R², 0 beyond,
 
-with a and b the place of p in photograph i, from -1 to 1 between its sides, and S_i the mean of x xᵀ over its pixels, x
-being (color, 1): of all departures D(p) is nearest to those of the photographs, in their colors
-(`training.exposure_centering`). A color c is drawn as c + D(p) [c, 1].
+with D_i the departure of photograph i [3, 4]; a and b the place of p in it, from -1 to 1 between its sides; S_i the
+mean of x xᵀ over its pixels, x being (color, 1), and S the mean of all S_i. So D(p) comes nearest to the departures of
+the photographs, by least squares in their pixels (`training.exposure_centering`); beyond all photographs it is 0.
+A color c is drawn as c + D(p) [c, 1]; what is behind the scene keeps its color.
 """
 
 from __future__ import annotations
@@ -29,8 +30,13 @@ CELLS = 64
 #: The grid reaches over so much of the anchors along x and y, which leaves out what is far away; beyond it the value at
 #: its border holds.
 INNER_SHARE = 0.98
-#: Added to the diagonal of Σ w_i S_i, as a share of its trace, and so much alone: photographs in one color leave D
-#: open, and where none counts it is 0.
+#: R: photographs count for places up to so far from their middle, in halves of their sides (chosen on validation views:
+#: experiments/reports/few-cameras.md).
+REACH = 3.0
+#: w: that of no departure, as a share of a photograph whose middle shows the place (choice).
+PRIOR = 1e-3
+#: Added to the diagonal of what is inverted, as a share of its trace, and so much alone: photographs in one color leave
+#: D open, and where no pixel counts it is 0.
 RIDGE, TINY = 1e-7, 1e-30
 #: Places that are no farther along the axis of a camera, in units of the ground frame, are not before it.
 _NEAREST = 1e-6
@@ -64,10 +70,13 @@ class LocalExposure:
 
     def check(self) -> None:
         """Raise ValueError unless the grid is one, of finite numbers."""
-        shape = tuple(self.departures.shape)
+        shape, dtype = tuple(self.departures.shape), self.departures.dtype
         if len(shape) != 4 or shape[2:] != (3, 4) or not all(shape):
             raise ValueError(f"local exposure has shape {shape}, not [rows, columns, 3, 4]")
-        if not (bool(torch.isfinite(self.departures).all()) and 0 < self.spacing < np.inf):
+        if dtype != torch.float32:
+            raise ValueError(f"local exposure is {dtype}, not torch.float32")
+        placed = np.isfinite([self.x, self.y]).all() and 0 < self.spacing < np.inf
+        if not (placed and bool(torch.isfinite(self.departures).all())):
             raise ValueError("local exposure holds numbers that are not finite")
 
 
@@ -87,13 +96,14 @@ def _between(first: Float[Tensor, "12 n"], second: Float[Tensor, "12 n"], share:
 def apply_departures(
     colors: Float[Tensor, "m 3"], departures: Float[Tensor, "12 n"], of: Int[Tensor, " m"]
 ) -> Float[Tensor, "m 3"]:
-    """c + D [c, 1] of colors c, each with the departure of the place that `of` counts."""
+    """c + D [c, 1] of colors c, each with the departure of the place that `of` counts. None is below 0: no file has
+    such colors."""
     planes = [colors[:, channel].contiguous() for channel in range(3)]
     drawn = torch.empty_like(colors)
     for channel, plane in enumerate(planes):
         red, green, blue, constant = departures[4 * channel : 4 * channel + 4].index_select(1, of)
         sums = red.mul_(planes[0]).add_(green.mul_(planes[1])).add_(blue.mul_(planes[2])).add_(constant)
-        drawn[:, channel] = sums.add_(plane)
+        drawn[:, channel] = sums.add_(plane).clamp_(min=0)
     return drawn
 
 
@@ -102,15 +112,17 @@ def fit_local_exposure(
     color_moments: Float[Tensor, "images 4 4"],
     cameras: Sequence[Camera],
     positions: Float[Tensor, "n 3"],
+    reach: float = REACH,
 ) -> LocalExposure:
     """D(p) of photographs, their S_i and their cameras, over the places of a scene's anchors."""
     x, y, spacing, places = _grid(positions.detach().cpu().double().numpy())
     of_image, moments = (each.detach().cpu().double().numpy() for each in (departures, color_moments))
     departed, of_colors = np.zeros((*places.shape[:2], 3, 4)), np.zeros((*places.shape[:2], 4, 4))
     for camera, departure, moment in zip(cameras, of_image, moments, strict=True):
-        weight = _weights(camera, places)[..., None, None]
+        weight = _weights(camera, places, reach)[..., None, None]
         departed += weight * (departure @ moment)
         of_colors += weight * moment
+    of_colors += PRIOR * moments.mean(axis=0)
     ridge = RIDGE * np.trace(of_colors, axis1=2, axis2=3) + TINY
     of_colors += ridge[..., None, None] * np.eye(4)
     # Both sides transposed: of_colors is symmetric.
@@ -118,10 +130,12 @@ def fit_local_exposure(
     return LocalExposure(torch.from_numpy(np.ascontiguousarray(found)).float(), x, y, spacing)
 
 
-def _weights(camera: Camera, places: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns"]:
+def _weights(
+    camera: Camera, places: Float[np.ndarray, "rows columns 3"], reach: float
+) -> Float[np.ndarray, "rows columns"]:
     pixels, depths = camera.project(places.reshape(-1, 3))
-    aside = 2 * pixels / (camera.width, camera.height) - 1
-    weights = np.where(depths > _NEAREST, 1 / (1 + (aside**2).sum(axis=1)), 0.0)
+    aside = ((2 * pixels / (camera.width, camera.height) - 1) ** 2).sum(axis=1) / reach**2
+    weights = np.where((depths > _NEAREST) & (aside < 1), (1 - aside) ** 2, 0.0)
     return weights.reshape(places.shape[:2])
 
 
@@ -130,9 +144,8 @@ def _grid(positions: Float[np.ndarray, "n 3"]) -> tuple[float, float, float, Flo
     low, high = np.quantile(positions[:, :2], [(1 - INNER_SHARE) / 2, (1 + INNER_SHARE) / 2], axis=0)
     spacing = float((high - low).max()) / CELLS or 1.0
     columns, rows = (np.floor((high - low) / spacing).astype(int) + 1).tolist()
-    column, row = np.rint((positions[:, :2] - low) / spacing).astype(int).T
-    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    node, heights = (row * columns + column)[inside], positions[inside, 2]
+    column, row = np.rint((positions[:, :2] - low) / spacing).clip(0, [columns - 1, rows - 1]).astype(int).T
+    node, heights = row * columns + column, positions[:, 2]
     order = np.lexsort((heights, node))
     present, first, counts = np.unique(node[order], return_index=True, return_counts=True)
     z = np.full(rows * columns, np.nan)

@@ -16,6 +16,7 @@ from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_folder import StatusRecord
+from vdgs.system.console import show_share
 from vdgs.system.memory.process_memory import peak_memory_bytes, reset_peak_memory
 from vdgs.system.quoting import shell_word
 from vdgs.system.tensors import file_id
@@ -42,8 +43,10 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         reset_peak_memory()
         start = time.monotonic()
         opened = context.open_model("coarse")
-        views = opened.capture.train_views
-        coarse = with_local_exposure(opened.model, [view.camera for view in views])
+        views, coarse = opened.capture.train_views, opened.model
+        if run.method().merge.reference_exposure == "local":  # of a version that gave the coarse model none?
+            with show_share(console, "colors of the photographs") as on_progress:
+                coarse = with_local_exposure(coarse, [view.camera for view in views], on_progress)
         cameras = [[views[i].camera for i in indices] for indices in all_block_view_indices(run, opened.capture)]
         trained = [
             partial(load_verified, folder, keys.blocks, index) if done[index] else None

@@ -122,7 +122,9 @@ def _train(
     metadata = ModelMetadata(
         capture=capture_metadata(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
     )
-    model = with_local_exposure(state.model(stage, metadata), [view.camera for view in capture.train_views])
+    with show_progress("colors of the photographs", console, run) as on_progress:
+        cameras = [view.camera for view in capture.train_views]
+        model = with_local_exposure(state.model(stage, metadata), cameras, on_progress)
     finish_stage(folder, state, model, console)
 
 

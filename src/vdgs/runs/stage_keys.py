@@ -52,6 +52,8 @@ def stage_keys(
         if stage == "blocks":  # what is asked counts by what it does
             del own["block"]["mask_moving"]
             own |= {"masks": "auto"} if leaves_out_motion(settings, keys["visibility"], motion or {}) else {}
+        if stage == "merge" and not settings.training.exposure_compensation:
+            del own["merge"]["reference_exposure"]  # there is none, and runs of before stay as they are
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)

@@ -14,10 +14,12 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from vdgs.captures.image_files import open_image, same_aspect
+from vdgs.sfm.brackets import SAME_STOPS
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
+from vdgs.sfm.rig_folders import may_be_sensor
 
 #: Focal lengths within this share of each other are one.
 ONE_FOCAL = 0.02
@@ -42,8 +44,6 @@ _COPY_NAME = re.compile(
 _SAME_MOMENT = timedelta(seconds=2)
 #: Programs that convert photographs may round places by so much (about a metre; choice).
 _ROUNDED_DEG = 1e-5
-#: Exposures that differ by fewer stops are one, as EXIF rounds them.
-SAME_STOPS = 0.2
 #: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
 _PREFERRED = ("panchro", "green", "red", "blue")
 #: Fewer color photographs than this share of the exposures are none of the set.
@@ -281,7 +281,7 @@ def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
                 for other in alike
                 if max(photo.size) <= SMALLER * max(other.size)
                 and same_aspect(photo.size, other.size)
-                and not taken_apart(photo, other)
+                and (not taken_apart(photo, other) or _show_the_same([(photo, other)]))  # programs rewrite dates
             ]
             if larger and photo.size != usual:
                 largest = max(larger, key=lambda other: other.width * other.height)
@@ -305,15 +305,17 @@ def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 
 def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """Photographs that another folder has too, edited or as raw files: of one name, moment, place and shape, and they
-    show the same. The folder of more photographs is used. Cameras of a rig share names, moments and places, too, and
-    show something else."""
+    show the same. The folder of more photographs is used. Folders of the cameras of a rig are not compared with each
+    other: they share names, moments and places, and may show nearly the same."""
     folders: dict[str, dict[str, ImageMetadata]] = {}
     for photo in photographs:
         path = PurePosixPath(photo.name)
         folders.setdefault(str(path.parent), {})[path.stem.lower()] = photo
-    found, kept = dict[str, str](), list[dict[str, ImageMetadata]]()
+    found, kept = dict[str, str](), list[tuple[str, dict[str, ImageMetadata]]]()
     for folder in sorted(folders, key=lambda each: (_are_raw(folders[each]), -len(folders[each]), len(each), each)):
-        for other in kept:
+        for name, other in kept:
+            if may_be_sensor(folder) and may_be_sensor(name):
+                continue
             shared = sorted(folders[folder].keys() & other.keys())
             pairs = [(other[stem], folders[folder][stem]) for stem in shared]
             pairs = [(one, photo) for one, photo in pairs if one.name not in found and _is_one_exposure(one, photo)]
@@ -322,7 +324,7 @@ def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
                     found[photo.name] = (
                         f"is another version of {one.name}, by its name, moment, place and what it shows"
                     )
-        kept.append(folders[folder])
+        kept.append((folder, folders[folder]))
     return found
 
 

@@ -331,8 +331,9 @@ def no_better_than_left(accuracy: AccuracyFacts, left: Float[np.ndarray, "n 3"])
     """
     if not accuracy.place_m or not len(left):
         return accuracy
-    times = float(stdtrit(max(1, len(left) - 1), 0.975)) / np.sqrt(len(left))
-    east, north, up = times * np.sqrt(np.nan_to_num(left**2).mean(axis=0))
+    counts = np.isfinite(left).sum(axis=0)
+    times = stdtrit(np.maximum(1, counts - 1), 0.975) / np.sqrt(np.maximum(1, counts))
+    east, north, up = times * np.sqrt(np.nansum(left**2, axis=0) / np.maximum(1, counts))
     across_and_up = (float(np.hypot(east, north)), float(up))
     return replace(accuracy, place_m=tuple(map(max, accuracy.place_m, across_and_up)))
 

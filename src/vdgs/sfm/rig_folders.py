@@ -30,6 +30,11 @@ _SIGMAS = 3.0
 Frames = list[tuple[ImageMetadata, ImageMetadata]]
 
 
+def may_be_sensor(folder: str) -> bool:
+    """Whether a folder is called as those of the cameras of a rig are."""
+    return _SENSOR.fullmatch(PurePosixPath(folder).name) is not None
+
+
 def with_sensors(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetadata], list[str]]:
     """The photographs, each with the folder of its camera where that is one of a rig, and what to say of the rigs."""
     folders: dict[str, list[ImageMetadata]] = {}

@@ -16,7 +16,7 @@ A trained scene is drawn in what photographs of each place depart by from that (
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -91,14 +91,20 @@ def center_exposures(departures: Float[Tensor, "images 3 4"], moments: ExposureM
     moments.zero_()
 
 
-def with_local_exposure(model: AnchorModel, cameras: Sequence[Camera]) -> AnchorModel:
+def with_local_exposure(
+    model: AnchorModel, cameras: Sequence[Camera], on_progress: Callable[[int, int], None] = lambda done, total: None
+) -> AnchorModel:
     """A trained model, in the exposure that photographs of a place have in the mean (`AnchorModel.local_exposure`), if
-    exposures were fitted; itself where it has one. `cameras` are those of the training photographs."""
+    exposures were fitted; itself where it has one. `cameras` are those of the training photographs, each of which is
+    drawn, small; `on_progress` is told of how many of them that is done."""
     exposure, positions = model.decoder.exposure, model.anchors.positions
     if exposure is None or model.local_exposure is not None:
         return model
-    moments = torch.stack([_color_moments(model, camera) for camera in cameras])
-    found = fit_local_exposure(exposure, moments, cameras, positions)
+    moments = []
+    for camera in cameras:
+        moments.append(_color_moments(model, camera))
+        on_progress(len(moments), len(cameras))
+    found = fit_local_exposure(exposure, torch.stack(moments), cameras, positions)
     return replace(model, local_exposure=found.to(positions.device))
 
 
