@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from support.flights import small_photographs
 from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_tables import read_gps_table
+from vdgs.captures.table_columns import number_of
 from vdgs.errors import CaptureError
 from vdgs.sfm.gps_priors import read_gps_priors
 
@@ -375,3 +377,95 @@ def test_columns_that_are_no_minutes_of_the_angles_that_are_read(tmp_path, heade
     system = "EPSG:32719\n" if "easting" in header else ""
     (tmp_path / "t.csv").write_text(f"{system}{header}\n{row}\n")
     assert read_gps_table(tmp_path / "t.csv").rows[0].position == pytest.approx(PLACE, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("columns", "values"),
+    [
+        ("海拔高度(m)", "500"), ("大地高", "500"), ("椭球高", "500"), ("相对高度,绝对高度", "60,500"),
+        ("Cota (m)", "500"), ("Altitudine", "500"), ("Elevación", "500"), ("Altitude NGF (m)", "500"),
+        ("Höhe über NN", "500"),
+        ("Flughöhe über Grund;Höhe ü. NHN", "60;500"), ("Höhe (m ü. M.)", "500"), ("Ellipsoidische Höhe [m]", "500"),
+        ("Hauteur ellipsoïdale", "500"), ("Altitud sobre el nivel del mar", "500"), ("Hauteur/sol;Altitude", "60;500"),
+        ("height above sea level", "500"), ("AGL,MSL", "60,500"), ("Altitude (AGL) [m],Altitude (AMSL) [m]", "60,500"),
+        ("altitude (relative),altitude (absolute)", "60,500"), ("elevation,altitude", "450,500"),
+        ("altitude(m above ground),elevation(m ASL)", "60,500"), ("height (agl),height (msl)", "60,500"),
+        ("geoid height,height", "30,500"), ("geoid height,ellipsoidal height", "30,500"),
+        ("Altitud (pies)", "1640.41995"), ("Höhe (Fuß)", "1640.41995"), ("Altitude (pieds)", "1640.41995"),
+        ("高度(英尺)", "1640.41995"), ("alt (')", "1640.41995"), ("alt", "1640.41995 pies"), ("alt", "500 m ü. NN"),
+    ],
+)  # fmt: skip
+def test_altitudes_are_known_by_what_their_headings_mean(tmp_path, columns, values):
+    separator = ";" if ";" in columns else ","
+    head, row = (
+        separator.join(each) for each in (("name", "lat", "lon", columns), ("a.jpg", "-33.5", "-70.6", values))
+    )
+    (file := tmp_path / "t.csv").write_text(f"{head}\n{row}\n", encoding="utf-8")
+    read = read_gps_table(file)
+    assert read.rows[0].position == pytest.approx(PLACE, abs=1e-5)
+    assert not any("not read" in note or "not understood" in note for note in read.notes)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "said"),
+    [
+        ("Altitude (AGL)", "60", "'Altitude (AGL)': over the ground"), ("geoid height", "30", "or the geoid, no alt"),
+        ("Hoogte", "500", "no column is known as the altitude; not read: 'Hoogte' (500)"),
+    ],
+)  # fmt: skip
+def test_heights_that_are_not_read_are_named(tmp_path, column, value, said):
+    (file := tmp_path / "t.csv").write_text(f"name,lat,lon,yaw,{column}\na.jpg,-33.5,-70.6,90,{value}\n")
+    read = read_gps_table(file)
+    assert math.isnan(read.rows[0].position[2])
+    assert said in " ".join(read.notes)
+    assert "yaw" not in " ".join(read.notes)
+
+
+def test_brackets_of_headings_that_are_not_understood_are_named(tmp_path):
+    (file := tmp_path / "t.csv").write_text("name,lat (m),lon [deg],alt (klafter)\na.jpg,-33.5,-70.6,500\n")
+    notes = " ".join(read_gps_table(file).notes)
+    assert "'lat (m)' is not understood; read as degrees" in notes
+    assert "'alt (klafter)' is not understood; read as metres" in notes
+    assert "'lon [deg]'" not in notes
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("lat,N/S,lon,E/W", "33.5,S,70.6,W"), ("lat,Hemisphere,lon,hemisphere", "33.5,s,70.6,w"),
+        ("Latitude (S),Longitude (W)", "33.5,70.6"), ("Lat [°S],Lon [°W]", "33.5,70.6"),
+        ("Lat (°N),Lon (°E)", "-33.5,-70.6"), ("lat,yes,lon", "-33.5,N,-70.6"), ("Lat [°N],Lon [°W]", "33.5 S,70.6"),
+        ("lat [gon],lon [gon]", f"{-33.5 / 0.9},{-70.6 / 0.9}"), ("Latitud;Longitud", "33,5 S;70,60000 O"),
+        ("Breite;Länge", "33°30'0,00\" S;289,40000° O"), ("Latitude;Hauteur/sol;Longitude", "33,50 S;60,0;70°36' O"),
+        ("lat (DMS),lon (DMS)", "-33 30 0,-70 36 0"), ("Lat (ddmm.mmm),NS,Lon (dddmm.mmm),EW", "3330.000,S,7036.000,W"),
+    ],
+)  # fmt: skip
+def test_hemispheres_and_units_of_angles_are_read_wherever_they_are_said(tmp_path, head, row):
+    separator = ";" if ";" in head else ","
+    rows = f"name{separator}{head}\na.jpg{separator}{row}\n"
+    (file := tmp_path / "t.csv").write_text(rows, encoding="utf-8")
+    latitude, longitude, _ = read_gps_table(file).rows[0].position
+    assert (latitude, longitude % 360) == pytest.approx((-33.5, 289.4), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "said"),
+    [("lat (DDMMSS.ss),lon (DDMMSS.ss)", "-33.30,-70.36", "in one number"), ("lat,lon", "33.5 S,70.6 O", "O is west")],
+)
+def test_angles_that_may_mean_two_things_are_refused(tmp_path, head, row, said):
+    (file := tmp_path / "t.csv").write_text(f"name,{head}\na.jpg,{row}\n")
+    with pytest.raises(CaptureError, match=f"line 2: .*{said}.* Write"):
+        read_gps_table(file)
+
+
+@pytest.mark.parametrize("units", [",deg,deg,ft", "[-],[°],[°],[ft]", "-,°,°,pies"])
+def test_a_row_of_units_below_the_headings_counts(tmp_path, units):
+    (file := tmp_path / "t.csv").write_text(f"name,lat,lon,alt\n{units}\na.jpg,-33.5,-70.6,1640.41995\n")
+    read = read_gps_table(file)
+    assert [row.position for row in read.rows] == [pytest.approx(PLACE, abs=1e-5)]
+    assert not read.notes
+
+
+@pytest.mark.parametrize("number", ["350\u00a0000,12", "350\u202f000,12", "350 000,12", "350'000.12", "350.000,12"])
+def test_signs_between_thousands_are_those_of_any_country(number):
+    assert number_of(number) == 350000.12

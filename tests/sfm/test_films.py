@@ -389,3 +389,10 @@ def test_moments_without_a_clock_in_the_film(tmp_path: Path):
     moments = [datetime.strptime(photo.datetime, "%Y:%m:%d %H:%M:%S") for photo in images.images]
     assert moments == sorted(moments)
     assert (moments[0], moments[-1]) == (datetime(2026, 6, 1, 10, 0, 57), datetime(2026, 6, 1, 10, 0, 59))
+
+
+def test_positions_between_records_on_both_sides_of_the_antimeridian_lie_between_them():
+    blocks = [(float(k), f"[latitude: -16.8] [longitude: {179.99998 * side}]") for k, side in enumerate((1, -1))]
+    records = read_telemetry(blocks)
+    for seconds, expected in ((0.25, 179.99999), (0.75, -179.99999)):
+        assert telemetry_at(records, seconds).lat_lon == pytest.approx((-16.8, expected), abs=1e-9)

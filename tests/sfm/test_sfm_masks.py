@@ -7,6 +7,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
@@ -263,3 +264,24 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     assert (picture.mask.numpy().astype(bool) == truth).mean() > 0.97
     quarter = load_capture(output, CaptureOptions(images="images_4")).views[0]
     assert load_image(quarter).mask.float().mean() == pytest.approx(truth.mean(), abs=0.05)
+
+
+def test_what_is_transparent_in_a_mask_is_not_kept(tmp_path):
+    """Whether it is white below, 16 bits deep, gray with an alpha channel, or the photograph itself, cut out."""
+    left = np.arange(8) < 4
+    alpha = np.where(left, 255, 0).astype(np.uint8)
+    dark = np.random.default_rng(0).integers(0, 100, (6, 8, 3)).astype(np.uint8)
+    white = np.full((6, 8), 255, np.uint8)
+    flat = np.broadcast_to(alpha, (6, 8))
+    upper = np.where(np.arange(6)[:, None] < 3, white, 0)
+    for pixels, expected in (
+        (np.dstack([white, white, white, flat]), np.broadcast_to(left, (6, 8))),
+        (np.dstack([upper, upper, upper, flat]), (upper > 0) & left),
+        (np.dstack([dark, flat]), np.broadcast_to(left, (6, 8))),
+        (np.dstack([white, white, white, white]), np.full((6, 8), True)),
+    ):
+        for deep in (pixels, pixels.astype(np.uint16) * 257):
+            cv2.imwrite(str(tmp_path / "mask.png"), deep)
+            np.testing.assert_array_equal(decode_mask(tmp_path / "mask.png", 8, 6), expected)
+    Image.fromarray(np.dstack([white, flat]), "LA").save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(decode_mask(tmp_path / "mask.png", 8, 6), np.broadcast_to(left, (6, 8)))

@@ -462,3 +462,12 @@ def test_the_same_level_view_in_all_photographs_is_a_default(tmp_path):
     same, other = (collect_images([tmp_path / name]).images for name in ("same", "other"))
     assert all(photo.attitude is None and "default" in photo.doubts[0] for photo in same)
     assert all(photo.attitude is not None and not photo.doubts for photo in other)
+
+
+@pytest.mark.parametrize(("reference", "expected"), [("1", -15.0), ("0", 15.0), (None, 15.0)])
+def test_altitudes_of_xmp_have_a_reference_too(reference, expected):
+    """As Lightroom and exiftool write them into sidecars."""
+    xmp = {"exif:GPSAltitude": "15000/1000"} | ({"exif:GPSAltitudeRef": reference} if reference else {})
+    (value, source), _ = read_altitudes({}, xmp)
+    assert value == expected
+    assert source.startswith("exif:GPSAltitude in XMP")

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vdgs.captures.angles import degrees_of_text
+from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
 from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
     datum_error,
@@ -28,18 +29,22 @@ from vdgs.captures.coordinate_systems import (
     to_geodetic,
 )
 from vdgs.captures.table_columns import (
-    ANGLES,
     NO_DATA,
-    RADIANS,
     UNKNOWN,
+    Row,
     has_time,
+    heading_notes,
     known_columns,
     meters_of,
     number_of,
     parted_angles,
+    plain_number,
+    west_or_east,
     with_names,
+    with_sides,
+    with_units,
 )
-from vdgs.captures.text_tables import LOOKED_AT, Line, Row, read_lines, rows_of
+from vdgs.captures.text_tables import LOOKED_AT, Line, read_lines, rows_of
 from vdgs.errors import CaptureError
 
 _BY_TIME = (
@@ -61,8 +66,9 @@ _OTHERS = (
 _DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
-_DATUM = re.compile(r"sea|\b(?:a?m?sl|hae|ellipsoid(?:al)?|wgs ?84)\b", re.IGNORECASE)
-_LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?:m|metres|meters)?\b", re.IGNORECASE)
+_LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)")
+#: O behind an angle stands for east or for west.
+_O = re.compile(r"\bO\b|(?<=[\d'\"″′°])O$|^O(?=\d)", re.IGNORECASE)
 #: Degrees and minutes in one number, of which programs may have cut the zeros before the other angle of the row.
 _NMEA = re.compile(r"\d{4,5}\.\d+")
 #: DJI's list of moments (.MRK): one line for each photograph, by its number.
@@ -109,6 +115,10 @@ class _Columns(NamedTuple):
     """Metres in one of each of its accuracies, NaN for angles."""
     across_units: tuple[float, float] = (1.0, 1.0)
     """Metres (of angles degrees) in one of x and of y where their names say another unit, as `[km]`; 1 elsewhere."""
+    angles: Mapping[str, Heading] = MappingProxyType({})
+    """The headings of latitudes and longitudes."""
+    o_side: str = ""
+    """What O stands for, E or W, where the headings tell."""
 
 
 def read_gps_table(file: Path) -> GpsTable:
@@ -132,7 +142,8 @@ def read_gps_table(file: Path) -> GpsTable:
     body = [Line(line.number, line.text.lstrip("# ") if k == 0 else line.text) for k, line in enumerate(body)]
     if not body:
         raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
-    rows = rows_of(body)
+    rows = with_units(rows_of(body))
+    head_row, count = rows[0], len(rows)
     columns, rows = _columns(rows, system, file)
     if not rows:
         raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
@@ -150,6 +161,9 @@ def read_gps_table(file: Path) -> GpsTable:
     ]
     notes = list[str]()
     notes += [f"{file.name} {columns.note}"] if columns.note else []
+    if len(rows) < count:
+        doubts = heading_notes(head_row.words, columns.where, [row.words for row in rows])
+        notes += [f"{file.name}: {doubt}" for doubt in doubts]
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
@@ -181,7 +195,8 @@ def _is_header(line: Line) -> bool:
 
 def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
     """The columns and the rows below their names. Raises CaptureError."""
-    known = with_names(known_columns(rows[0].words), [row.words for row in rows[1:]])
+    below = [row.words for row in rows[1:]]
+    known = with_sides(with_names(known_columns(rows[0].words), below), below)
     if {"lat", "lon"} <= set(known) and (parts := parted_angles(rows[0].words)):
         raise CaptureError(
             f"{file}: has minutes and seconds in columns of their own ({', '.join(map(repr, parts))}). Write each "
@@ -191,14 +206,13 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
     others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
     heights = (rows[0].words[known["alt"]], *others) if others else ()
     named = {what: rows[0].words[known[what]] for what in _DEVIATIONS if what in known}
-    units = {what: math.nan if ANGLES.search(word) else meters_of(word) for what, word in named.items()}
+    units = {what: meters_of(word) if read_heading(word).degrees is None else math.nan for what, word in named.items()}
     if {"name", "lat", "lon"} <= set(known):
-        latitude, longitude = (
-            math.degrees(1) if RADIANS.search(rows[0].words[known[what]]) else 1.0 for what in ("lat", "lon")
-        )
-        angles = latitude, longitude
+        angles = {what: read_heading(rows[0].words[known[what]]) for what in ("lat", "lon")}
+        latitude, longitude = (1.0 if angle.degrees is None else angle.degrees for angle in angles.values())
         datum = system if system is not None and _is_datum(system, file) else None
-        return _Columns(known, datum, unit, heights=heights, deviation_units=units, across_units=angles), rows[1:]
+        columns = _Columns(known, datum, unit, "", heights, units, (latitude, longitude), angles)
+        return columns._replace(o_side=west_or_east(rows[0].words)), rows[1:]
     if {"lat", "lon"} <= set(known):
         found = ", ".join(word for word in rows[0].words if word)
         remedy = f"It is {_BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
@@ -289,7 +303,7 @@ def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[
     found = []
     for row in rows:
         angles = [
-            _angle(row, columns, what, reference, axis)
+            _angle(row, columns, what, reference, axis, file)
             for what, reference, axis in (("lat", "latref", "latitude"), ("lon", "lonref", "longitude"))
         ]
         if None in angles:
@@ -314,18 +328,38 @@ def _other_degrees(latitude: float, longitude: float) -> str:
     return ""
 
 
-def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str) -> float | None:
-    word = _word(row, columns, what)
+def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, file: Path) -> float | None:
+    """An angle of a row in the unit of its column; its own side counts before that of another column or the heading's.
+    Raises CaptureError for numbers that the heading says to be no decimal ones, and for an O that may be either side.
+    """
+    word, side_word, heading = _word(row, columns, what), _word(row, columns, reference), columns.angles.get(what)
+    if _O.search(word) or side_word.upper() == "O":
+        if not columns.o_side:
+            raise CaptureError(
+                f"{file}: line {row.number}: O is west (oeste, ouest, ovest) or east (Ost). Write W or E instead."
+            )
+        word, side_word = _O.sub(columns.o_side, word), _O.sub(columns.o_side, side_word)
+    if word.count(",") == 1 and "." not in word:
+        word = word.replace(",", ".")
+    side_word = side_word[:1] or (heading.side if heading is not None else "")
     try:
-        number, side_word = float(word), _word(row, columns, reference)[:1]
+        number = float(word)
         read: tuple[float, bool] | None = (number, False)
-        if side_word and any(_NMEA.fullmatch(_word(row, columns, each)) for each in ("lat", "lon")):
+        in_minutes = any(_NMEA.fullmatch(_word(row, columns, each)) for each in ("lat", "lon"))
+        if side_word and in_minutes:
             read = degrees_of_text(f"{abs(number) // 100:.0f} {abs(number) % 100:.9f} {side_word}", axis) or read
+        elif heading is not None and heading.packed:
+            raise CaptureError(
+                f"{file}: line {row.number}: {axis} {word}: degrees, minutes and seconds in one number are not read. "
+                "Write degrees such as -33.51234, or words such as 33 30 44.4 S."
+            )
     except ValueError:
         read = degrees_of_text(word, axis)
+        if read is not None and heading is not None and heading.side and read[1]:
+            side_word = ""
     if read is None:
         return None
-    side = degrees_of_text(f"{abs(read[0])} {_word(row, columns, reference)[:1]}", axis)
+    side = degrees_of_text(f"{abs(read[0])} {side_word}", axis)
     return side[0] if side is not None and side[1] else read[0]
 
 
@@ -333,15 +367,15 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     word = _word(row, columns, "alt")
     if word.lower() in UNKNOWN:
         return math.nan
-    word = re.sub(r"[.,](?=.*[.,])", "", word) if math.isfinite(number_of(word)) else word  # thousands
+    word = plain_number(word)
     number = _LEADING_NUMBER.match(word)
-    unit = meters_of(word)
-    if number is None or (word[number.end() :].strip() and not _DATUM.search(word) and unit == 1):
+    behind = read_heading(f"({word[number.end() :]})") if number is not None else None
+    if number is None or behind is None or behind.unread or {*behind.meanings} - {*LENGTHS, "sea", "ellipsoid", ""}:
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
     value = float(number[1].replace(",", "."))
     if value in NO_DATA:
         return math.nan
-    value *= unit if unit != 1 else columns.altitude_unit
+    value *= behind.meters if behind.units else columns.altitude_unit
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 

@@ -65,6 +65,8 @@ SUPPORTED_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L",
 _COLOR_MARKS = (b"ICC_PROFILE\0", b"iCCP", b"ICCP", b"Adobe\0", b"R03\0")
 _HEAD_BYTES = 1 << 20
 _TIFF = (b"II", b"MM")
+#: A mask with transparency is a photograph that was cut out where more of its pixels have colors (choice).
+_MIN_COLORED = 0.05
 #: Values of 16 bits none of which is greater are those of 12 bits or fewer: black, as they are.
 _DARK = 4095
 
@@ -243,9 +245,19 @@ def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def _mask(path: Path) -> np.ndarray:
-    """What a mask keeps at its own size, [h, w] bool: of instant-ngp's what is black, of others what is bright."""
+    """What a mask keeps at its own size, [h, w] bool: of instant-ngp's what is black, of others what is bright and
+    opaque, of a photograph that was cut out all that is opaque."""
     light = _lightness(path)
-    return light == 0 if path.name.lower().startswith(DYNAMIC_MASK) else _kept(light)
+    if path.name.lower().startswith(DYNAMIC_MASK):
+        return light == 0
+    pixels = _decode(path)
+    if pixels.ndim == 2 or pixels.shape[2] != 4:
+        return _kept(light)
+    half = MASK_THRESHOLD if pixels.max() <= 255 else MASK_THRESHOLD * 257
+    opaque = pixels[..., 3] >= half
+    colored = np.ptp(pixels[..., :3][opaque], axis=1) > half // 16
+    cut_out = not opaque.all() and opaque.any() and colored.mean() > _MIN_COLORED
+    return opaque if cut_out else _kept(light) & opaque
 
 
 def _lightness(mask: Path) -> np.ndarray:
@@ -361,6 +373,9 @@ def _why_nothing(mask: Path) -> str:
     """Why a mask keeps nothing, and what to do."""
     if mask.name.lower().startswith(DYNAMIC_MASK):
         return f"Black is kept of masks that are named {DYNAMIC_MASK}..., and none of it is black. Turn it round"
+    pixels = _decode(mask)
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and _kept(_lightness(mask)).any():
+        return "It is transparent where it is white. Save it without transparency"
     brightest = int(_lightness(mask).max())
     hint = "Scale its values to 0 and 255" if brightest else "Turn it round if it is inverted"
     return f"White is kept, and the brightest value here is {brightest} of 255. {hint}"

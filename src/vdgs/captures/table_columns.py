@@ -1,13 +1,15 @@
-"""What the columns of tables are called, and the units that their names say."""
+"""Which column of a table is what, by its heading or by what it holds."""
 
 from __future__ import annotations
 
 import math
 import re
-import unicodedata
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import PurePosixPath
+from typing import NamedTuple
 
+from vdgs.captures.column_headings import LENGTHS, QUANTITIES, Heading, read_heading
 from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 
 #: What each column is called, once blanks, signs, accents, units and the case of letters are taken away.
@@ -28,10 +30,7 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
         "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude lange langengrad "
         "laenge laengengrad longitud longitudine 经度",
-        "alt": "alt altitude gpsaltitude gpsalt zaltitude altitudez altitudem height ellipsoidheight ellipsoidalheight "
-        "heightm heightz ele elev elevation z h up absolutealtitude altm cameraaltitude gpsheight zh altitudemsl "
-        "heightellipsoid ellh hell hmsl hae "
-        "elevationm altft altitudeft altitudefeet heightft hohe hoehe altitud altura quota 高度 海拔",
+        "alt": "z h up zh heightz pointz ellh hell hmsl hae msl amsl asl",
         "x": "x pointx "
         "easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
         "y": "y pointy northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
@@ -57,32 +56,33 @@ _COLUMNS: dict[str, frozenset[str]] = {
 _PICTURES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
 #: Names of columns of moments.
 _TIMES = re.compile(r"time|date|\butc|gpst|\btow\b|gpsweek|zeit|datum|hora|fecha|heure|时间|日期", re.IGNORECASE)
-_UNIT = re.compile(
-    r"[\[(][^\])]*[\])]|[_ ](?:decimal degrees|dd|deg|degrees|rad(?:ians)?|[kcm]?m|met(?:er|re)s?"
-    r"|(?:us[ _]?)?f(?:oo|ee)?t)$"
+FOOT_M = LENGTHS["ft"]
+#: Numbers with signs between thousands: 6,292,126.02 and 6.292.126,02; 350 000,12 (French) and 2'600'000.5 (Swiss).
+_THOUSANDS = re.compile(
+    r"[+-]?\d{1,3}(?:(?:,\d{3})+\.\d+|(?:\.\d{3})+,\d+|(?:[ \u00a0\u202f\u2009'’]\d{3})+(?:[.,]\d+)?)"
 )
-#: How the names of columns, and values, say that they are feet.
-_FEET = re.compile(r"(?:[\[( _\d]|^alt|^altitude|^height)(us[ _]?(?:survey[ _]?)?)?(?:ft|feet|foot)\b", re.IGNORECASE)
-FOOT_M, SURVEY_FOOT_M = 0.3048, 1200 / 3937
-#: Names of columns of altitudes that others of a table give way to: heights may be those over the ground.
-_ALTITUDE = re.compile(r"alt(?!ura)|elli?p|ellh|elev|海拔", re.IGNORECASE)
-#: Altitudes by names that are put together: `ell_hgt`, `alt_msl`, `Orthometric elevation`, `pointz`; none over ground.
-_ALTITUDES = re.compile(
-    r"(?!sensorheight)(?:gps|gnss|abs|absolute|ell|ellips|ellipsoid(?:al)?|ortho|orthometric|msl|amsl|wgs84|camera|geoid|sensor)*"
-    r"(?:altitude|alt|height|hgt|hght|elevation|elev)"
-    r"(?:gps|abs|ell|ellips|ellipsoid(?:al)?|ortho|msl|amsl|hae|wgs84|m)*|pointz"
+#: Signs of other columns of numbers than altitudes: angles, speeds, counts.
+_OTHERS = re.compile(
+    r"yaw|pitch|roll|omega|phi|kappa|head|course|gimbal|speed|sat|time|date|std|rms|acc|err|dop|iso|focal|width|lat|lon"
 )
-#: Numbers with signs between thousands and another one before the decimals: 6,292,126.02 and 6.292.126,02.
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:,\d{3})+\.\d+|(?:\.\d{3})+,\d+)")
-#: Units of columns: parts of metres, and angles.
-_PARTS = re.compile(r"[\[( _](mm|cm|km)\b", re.IGNORECASE)
-ANGLES = re.compile(r"°|[\[( _](?:deg|degrees|rad)\b", re.IGNORECASE)
-RADIANS = re.compile(r"[\[( _]rad(?:ians)?\b", re.IGNORECASE)
+#: Columns that hold the side of an angle alone.
+_SIDE_WORDS = {
+    "latref": frozenset(["n", "s", "north", "south", "nord", "sud", "süd", "norte", "sur", "sul"]),
+    "lonref": frozenset(["e", "w", "o", "east", "west", "est", "ost", "ovest", "este", "oeste", "ouest"]),
+}
+#: Headings in German, where O is east, and in languages where it is west.
+_GERMAN = re.compile(r"^(?:breit|lang|laeng|hohe|hoehe|dateiname|bild)")
+_ROMANCE = re.compile(
+    r"^(?:longitud(?:ine)?$|latitud(?:ine)?$|altitud(?:ine)?$|nom|imagen|imagem|archivo|fichier|hauteur|cot|quota|immagine)"
+)
 
 #: Columns of minutes and of seconds beside one of degrees: lat_min, Longitude (sec), lat_m.
 _ANGLE = r"(?:gps)?(lat(?:itude)?|lon(?:g(?:itude)?)?|lng)[\W_]+"
 _PARTED = re.compile(_ANGLE + r"(min(?:ute)?s?|sec(?:ond)?s?|m|s)\b\W*", re.IGNORECASE)
 _LARGEST = re.compile(_ANGLE + r"max", re.IGNORECASE)
+
+#: What altitudes are not measured from.
+_NO_ALTITUDES = frozenset({"ground", "undulation"})
 
 #: What programs write where they know nothing.
 UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
@@ -91,19 +91,106 @@ UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
 NO_DATA = frozenset({-9999.0, -99999.0, -32767.0, -32768.0})
 
 
+class Row(NamedTuple):
+    """The words of a line."""
+
+    number: int
+    words: list[str]
+
+
 def known_columns(words: Sequence[str]) -> dict[str, int]:
-    """Which of these names of columns is what."""
+    """Which of these names of columns is what. Of altitudes the first counts whose name says that it is none over the
+    ground, else an elevation, else a height; those over the ground and undulations of the geoid are none."""
     found: dict[str, int] = {}
+    ranks: dict[str, int] = {}
     for k, word in enumerate(words):
-        letters = unicodedata.normalize("NFKD", word.lower())  # accents are signs of their own, brackets are narrow
-        plain = re.sub(r"[\W_]", "", _UNIT.sub("", letters))
-        what = next((what for what, names in _COLUMNS.items() if plain in names), None)
-        what = "alt" if what is None and _ALTITUDES.fullmatch(plain) else what
-        if what == "alt" and what in found and _ALTITUDE.search(word) and not _ALTITUDE.search(words[found[what]]):
-            found[what] = k
-        elif what is not None:
-            found.setdefault(what, k)
+        heading = read_heading(word)
+        names = {heading.plain, heading.stem}
+        what = next((what for what, known in _COLUMNS.items() if names & known), "alt" if heading.quantity else None)
+        if what is None or (what == "alt" and heading.datum in _NO_ALTITUDES):
+            continue
+        rank = _rank(heading) if what == "alt" else 0
+        if rank < ranks.get(what, len(QUANTITIES)):
+            found[what], ranks[what] = k, rank
     return found
+
+
+def _rank(heading: Heading) -> int:
+    return 0 if heading.datum or heading.quantity == "altitude" else 1 if heading.quantity == "elevation" else 2
+
+
+def with_sides(known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[str, int]:
+    """The known columns of these rows, with those of N or S and of E or W alone, where both are there."""
+    found: dict[str, int] = {}
+    for k in {*range(max(map(len, rows), default=0))} - {*known.values()}:
+        values = {row[k].strip().lower() for row in rows if k < len(row)} - UNKNOWN
+        found |= {what: k for what, sides in _SIDE_WORDS.items() if values and values <= sides and what not in found}
+    return {**found, **known} if len(found) == len(_SIDE_WORDS) else dict(known)
+
+
+def with_units(rows: list[Row]) -> list[Row]:
+    """The rows, where the second one names nothing but units these as the headings' own."""
+    if len(rows) < 2:
+        return rows
+    units = [word.strip("[]() ").replace("-", "") for word in rows[1].words]
+    headings = list(map(read_heading, (f"({unit})" for unit in units)))
+    if not any(heading.units for heading in headings) or any(heading.unread for heading in headings):
+        return rows
+    names = [f"{word} [{unit}]" if unit else word for word, unit in zip_longest(rows[0].words, units, fillvalue="")]
+    return [Row(rows[0].number, names), *rows[2:]]
+
+
+def west_or_east(words: Sequence[str]) -> str:
+    """What O stands for in a table of these headings: E for Ost, W for oeste, ouest, ovest; nothing where they do not
+    tell."""
+    plain = [read_heading(word).plain for word in words]
+    if any(map(_GERMAN.match, plain)):
+        return "E"
+    return "W" if any(map(_ROMANCE.match, plain)) else ""
+
+
+def heading_notes(words: Sequence[str], known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> list[str]:
+    """What to say of headings whose brackets are not understood, and of columns that are not read though they may be
+    altitudes."""
+    notes = []
+    for what in ("lat", "lon", "x", "y", "alt", "across", "upwards", "eastwards", "northwards"):
+        if what not in known or known[what] >= len(words):
+            continue
+        heading = read_heading(words[known[what]])
+        wrong = [each for each in heading.units if (each in LENGTHS) == (what in ("lat", "lon"))]
+        if heading.unread or (wrong and what in ("lat", "lon", "alt")):
+            unit = "degrees" if what in ("lat", "lon") else "metres"
+            notes.append(f"the unit of the column {words[known[what]]!r} is not understood; read as {unit}.")
+    if "alt" in known:
+        return notes
+    ground = [word for word in words if _is_other_height(read_heading(word))]
+    if ground:
+        notes.append(
+            f"{', '.join(map(repr, ground))}: over the ground, the take-off or the geoid, no altitude; not read."
+        )
+    columns = [(k, word, [row[k] for row in rows if k < len(row)]) for k, word in enumerate(words)]
+    spare = [
+        f"{word!r} ({values[0]})"
+        for k, word, values in columns
+        if k not in {*known.values()} and word not in ground and not _OTHERS.search(word.lower())
+        if _are_altitudes(values)
+    ]
+    if spare:
+        notes.append(
+            f"no column is known as the altitude; not read: {', '.join(spare[:6])}. If one is it, call it `alt`."
+        )
+    return notes
+
+
+def _is_other_height(heading: Heading) -> bool:
+    """Whether it is a height over the ground or an undulation."""
+    is_height = heading.quantity or heading.plain == "agl" or heading.datum == "undulation"
+    return bool(is_height) and heading.datum in _NO_ALTITUDES
+
+
+def _are_altitudes(words: Sequence[str]) -> bool:
+    values = [number_of(word.strip()) for word in words if word.strip().lower() not in UNKNOWN]
+    return bool(values) and all(-450 < value < 9000 for value in values)  # False for NaN
 
 
 def with_names(known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[str, int]:
@@ -137,18 +224,21 @@ def has_time(words: Sequence[str]) -> bool:
 
 
 def meters_of(word: str) -> float:
-    """How many metres the unit has that a word names: feet, US survey feet, parts of metres, or metres."""
-    feet = _FEET.search(word)
-    if parts := _PARTS.search(word):
-        return {"mm": 1e-3, "cm": 1e-2, "km": 1e3}[parts[1].lower()]
-    return 1.0 if feet is None else SURVEY_FOOT_M if feet[1] else FOOT_M
+    """How many metres the unit has that a heading names: feet, US survey feet, parts of metres, or metres."""
+    return read_heading(word).meters
 
 
 def number_of(word: str) -> float:
     """The number that a word says; NaN where it says none."""
-    if _THOUSANDS.fullmatch(word):  # the last sign is the decimal one
-        word = re.sub(r"[.,](?=.*[.,])", "", word).replace(",", ".")
     try:
-        return float(word)
+        return float(plain_number(word))
     except ValueError:
         return math.nan
+
+
+def plain_number(word: str) -> str:
+    """A word without the signs between thousands where it is such a number, of which the last sign is the decimal
+    one."""
+    if not _THOUSANDS.fullmatch(word.strip()):
+        return word
+    return re.sub(r"[.,](?=.*[.,])|[^\d.,+-]", "", word).replace(",", ".")

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from vdgs.captures.table_columns import known_columns
+from vdgs.captures.table_columns import Row, known_columns
 from vdgs.errors import CaptureError
 
 #: Larger files are no tables of photographs (bytes).
@@ -35,13 +35,6 @@ class Line(NamedTuple):
 
     number: int
     text: str
-
-
-class Row(NamedTuple):
-    """The words of a line."""
-
-    number: int
-    words: list[str]
 
 
 def read_lines(file: Path, what: str = "table of photographs") -> list[Line]:

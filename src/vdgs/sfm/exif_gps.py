@@ -124,14 +124,17 @@ def read_altitudes(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Alti
     """The altitude that is taken, and EXIF's and XMP's where these differ by a metre."""
     reference = gps.get(5)
     reference = reference[0] if isinstance(reference, bytes) and len(reference) == 1 else reference
-    value = finite(gps.get(6))
+    value, source = finite(gps.get(6)), ""
     if value is None:
-        value = first_number(xmp, "AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84", "exif:GPSAltitude")
-    elif str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3):
+        value = first_number(xmp, "AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84")
+        reference = None
+    if value is None and (value := first_number(xmp, "exif:GPSAltitude")) is not None:
+        reference, source = text(xmp, "exif:GPSAltitudeRef"), "exif:GPSAltitude in XMP"
+    if value is not None and (str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3)):
         value = -abs(value)
     absolute = first_number(xmp, "AbsoluteAltitude")
     if value is None or not absolute:
-        return _measured(value, absolute, xmp, ""), None
+        return _measured(value, absolute, xmp, source), None
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
     confirmed = bool(ellipsoidal and abs(ellipsoidal - value) < SAME_M)
     by_xmp = not confirmed and _is_absolute_otherwise(value, absolute, xmp)

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, datum_error, in_units_of, join_definition, to_geodetic
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
-from vdgs.captures.table_columns import NO_DATA, UNKNOWN, known_columns, meters_of, number_of
-from vdgs.captures.text_tables import Line, Row, rows_of, separator_of
+from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, meters_of, number_of
+from vdgs.captures.text_tables import Line, rows_of, separator_of
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear

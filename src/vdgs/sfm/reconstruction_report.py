@@ -69,7 +69,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, collection.images) if metric else None
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned, tilt)]
-    if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions have altitudes
+    if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions with altitudes
         up = placed.residuals[:, 2]
         names = [collection.images[int(positions.image_indices[row])].name for row in placed.position_rows]
         warnings += _lens_warnings(collection.images, dict(zip(names, up.tolist(), strict=True)), height)

@@ -19,6 +19,7 @@ from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.system.atomic_files import is_disk_full, read_json_or_empty, write_json
 from vdgs.system.console import make_progress_bar
+from vdgs.system.cpp_exceptions import catch_in_threads
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.step_progress import StepProgress, StepRecord
 from vdgs.system.stop_signals import check_stop_requested
@@ -162,19 +163,25 @@ def call_cancellable(function: Callable[..., Result], *arguments: Any, **named: 
         finally:
             over.set()
 
-    thread = threading.Thread(target=work, name="colmap")
+    def tell_failed() -> None:  # as COLMAP's threads do where their database finds no room
+        ended["error"], ended["hangs"] = RuntimeError("a thread of it failed"), True
+        over.set()
+
+    thread = threading.Thread(target=work, name="colmap", daemon=True)
     try:
-        thread.start()
-        # Not by joining the thread: a join that is interrupted takes the thread for ended.
-        while not over.wait(_POLL_SECONDS):
-            pass
+        with catch_in_threads(tell_failed):
+            thread.start()
+            # Not by joining the thread: a join that is interrupted takes the thread for ended.
+            while not over.wait(_POLL_SECONDS):
+                pass
         check_stop_requested()
     except BaseException:
         token.cancel()
         while not over.wait(_POLL_SECONDS) and thread.ident is not None:  # None: stopped before it began
             pass
         raise
-    thread.join()
+    if "hangs" not in ended:
+        thread.join()
     if "error" in ended:
         with explain_colmap_errors(Path(arguments[0]).parent if arguments else None):
             raise ended["error"]

@@ -98,7 +98,8 @@ def telemetry_at(records: Sequence[Telemetry], seconds: float) -> Telemetry:
     place = one.lat_lon
     if one.lat_lon is not None and other.lat_lon is not None:
         (latitude, longitude), (next_latitude, next_longitude) = one.lat_lon, other.lat_lon
-        place = latitude + share * (next_latitude - latitude), longitude + share * (next_longitude - longitude)
+        east = _wrapped(next_longitude - longitude)
+        place = latitude + share * (next_latitude - latitude), _wrapped(longitude + share * east)
     return replace(
         one,
         seconds=seconds,
@@ -107,6 +108,11 @@ def telemetry_at(records: Sequence[Telemetry], seconds: float) -> Telemetry:
         relative_altitude=_between(one.relative_altitude, other.relative_altitude, share),
         moment=one.moment and one.moment + timedelta(seconds=seconds - one.seconds),
     )
+
+
+def _wrapped(degrees: float) -> float:
+    """Brought into the range from -180 to 180; the same bits where it is there."""
+    return degrees - 360 * round(degrees / 360)
 
 
 def _between(one: float | None, other: float | None, share: float) -> float | None:
