@@ -160,6 +160,18 @@ def test_angles_are_read_from_text(text, degrees):
     assert (read and read[0]) == (degrees if degrees is None else pytest.approx(degrees))
 
 
+@pytest.mark.parametrize(
+    ("text", "axis", "degrees"),
+    [
+        ("北緯35度30分36秒", "latitude", 35.51), ("南纬33.5", "latitude", -33.5), ("东经 116°24′", "longitude", 116.4),
+        ("西経70.5", "longitude", -70.5), ("南纬33.5", "longitude", None), ("33.5 ю.ш.", "latitude", None),
+    ],
+)  # fmt: skip
+def test_sides_in_other_scripts_are_read_or_refused(text, axis, degrees):
+    read = degrees_of_text(text, axis)
+    assert read == (None if degrees is None else (pytest.approx(degrees), True))
+
+
 @pytest.mark.parametrize(("absolute", "altitude"), [("+96.20", 96.2), ("-96.20", -96), ("+300", -96), (None, -96)])
 def test_the_wrong_reference_of_an_altitude_gives_way_to_the_sign_in_xmp(absolute, altitude):
     xmp = {"drone-dji:AbsoluteAltitude": absolute} if absolute else {}

@@ -12,6 +12,8 @@ _NUMBER = re.compile(r"\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 _POINTS, _NMEA = re.compile(r"([+-]?\d{1,3})\.(\d{1,2})\.(\d{1,2}(?:\.\d+)?)"), re.compile(r"(\d{2,3})(\d\d\.\d+)")
 #: Words that degrees, minutes and seconds may be written with.
 _UNITS = re.compile(r"degrees?|deg|minutes?|min|seconds?|sec", re.IGNORECASE)
+#: Sides in Chinese and Japanese.
+_SIDES_BY_SIGN = {"北[緯纬]": "N", "南[緯纬]": "S", "[東东][経经經]": "E", "西[経经經]": "W"}
 #: Signs of other things than angles.
 _OTHER_SIGNS = re.compile(r"[%$€#*@!?=<>/|&~^]")
 #: What stands for the sign of degrees where a program lacks it: before minutes.
@@ -50,6 +52,11 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     """
     plain = _UNITS.sub(" ", unicodedata.normalize("NFKC", text.replace("\u00ba", " "))).strip()
     plain = _LOST_SIGN.sub(" ", plain)
+    for signs, side_letter in _SIDES_BY_SIGN.items():
+        plain = re.sub(signs, side_letter, plain)
+    plain = re.sub("(?<=\\d)[度分秒]", " ", plain)
+    if any(sign.isalpha() and not sign.isascii() for sign in plain):  # of a script that is not read
+        return None
     letters = re.findall(r"[A-Za-z]+", re.sub(r"\d[eE][+-]?\d", "00", plain))
     if len(letters) > 1 or _OTHER_SIGNS.search(plain):
         return None
