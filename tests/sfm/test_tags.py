@@ -224,6 +224,10 @@ def test_cut_photographs_have_the_focal_length_of_the_others_in_pixels_and_copie
     copy = replace(seen[0], name="p00 (1).jpg")
     assert list(strays([*seen, copy, replace(copy, name="p00-edited.jpg")])[0]) == ["p00 (1).jpg", "p00-edited.jpg"]
     assert strays([*seen, replace(copy, datetime="2026:06:02 10:00:00")])[0] == {}  # of another moment
+    phone = replace(seen[0], name="a/IMG_0001.HEIC"), replace(seen[0], name="a/IMG_E0001.JPG")
+    assert list(strays(phone)[0]) == ["a/IMG_E0001.JPG"]
+    enhanced = [replace(seen[0], name=name) for name in ("p.dng", "p-Enhanced-NR.dng", "p-HDR.jpg")]
+    assert list(strays(enhanced)[0]) == ["p-Enhanced-NR.dng", "p-HDR.jpg"]
 
 
 def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():

@@ -38,9 +38,11 @@ _DJI_NAME = re.compile(
 #: How systems and programs name what they copy, edit or download again.
 _COPY_NAME = re.compile(
     r"(.+?)(?:[ _]?\(\d{1,2}\)|[ _-]+(?:copy|copie|kopie|copia)(?:[ _]?\(?\d{1,2}\)?)?"
-    r"|[-_~](?:edited|edit|bearbeitet|\d))",
+    r"|[-_~](?:edited|edit|bearbeitet|hdr|enhanced(?:-(?:nr|sr|rd)){0,3}|\d))",
     re.IGNORECASE,
 )
+#: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
+_EDITED_ON_PHONE = re.compile(r"(.*\bIMG_)E(\d{4})", re.IGNORECASE)
 _SAME_MOMENT = timedelta(seconds=2)
 #: Programs that convert photographs may round places by so much (about a metre; choice).
 _ROUNDED_DEG = 1e-5
@@ -294,8 +296,9 @@ def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     names = {PurePosixPath(photo.name).with_suffix("").as_posix().lower(): photo for photo in photographs}
     found = {}
     for photo in photographs:
-        match = _COPY_NAME.fullmatch(PurePosixPath(photo.name).with_suffix("").as_posix())
-        first = names.get(match[1].lower()) if match else None
+        stem = PurePosixPath(photo.name).with_suffix("").as_posix()
+        match = _COPY_NAME.fullmatch(stem) or _EDITED_ON_PHONE.fullmatch(stem)
+        first = names.get("".join(match.groups()).lower()) if match else None
         if first is None or not photo.datetime or photo.camera != first.camera:
             continue
         if (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon):
