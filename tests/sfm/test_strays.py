@@ -168,12 +168,16 @@ def test_maps_of_ours_among_photographs_are_left_out(tmp_path):
     assert any("maps" in note for note in found.notes)
 
 
-def test_smaller_copies_in_another_folder_are_left_out(tmp_path):
+@pytest.mark.parametrize("rewritten", [False, True])
+def test_smaller_copies_in_another_folder_are_left_out(tmp_path, rewritten):
+    """Also those into which a program wrote its own date."""
     names = flight(tmp_path / "full")
     for name in names:
         with Image.open(tmp_path / "full" / name) as image:
             exif, shown = image.getexif(), np.asarray(image.resize((320, 240)))
         picture(tmp_path / "full" / name, shown, exif=exif)
+        if rewritten:
+            exif.get_ifd(0x8769)[0x9003] = "2026:07:01 12:00:00"
         picture(tmp_path / "web" / name, shown[::2, ::2], exif=exif)
     found = collect_images([tmp_path])
     assert [photo.name for photo in found.images] == [f"full/{name}" for name in names]

@@ -261,11 +261,22 @@ def _other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 
 def taken_apart(photo: ImageMetadata, other: ImageMetadata) -> bool:
     """Whether two photographs were taken at other moments or places, as far as both say it."""
-    moments, places = (photo.datetime, other.datetime), (photo.lat_lon, other.lat_lon)
-    apart = all(moments) and moments[0] != moments[1]
-    if places[0] is not None and places[1] is not None:
-        apart |= bool(np.abs(np.subtract(places[0], places[1])).max() > _ROUNDED_DEG)
-    return apart
+    moments = photo.datetime, other.datetime
+    return (all(moments) and moments[0] != moments[1]) or _are_of_other_places(photo, other)
+
+
+def _are_of_other_places(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    if photo.lat_lon is None or other.lat_lon is None:
+        return False
+    return bool(np.abs(np.subtract(photo.lat_lon, other.lat_lon)).max() > _ROUNDED_DEG)
+
+
+def _is_copy(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether two photographs of one name and shape are one. Programs rewrite dates: where those alone differ, what the
+    photographs show tells."""
+    if _are_of_other_places(photo, other):
+        return False
+    return not taken_apart(photo, other) or _show_the_same([(photo, other)])
 
 
 def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
@@ -283,7 +294,7 @@ def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
                 for other in alike
                 if max(photo.size) <= SMALLER * max(other.size)
                 and same_aspect(photo.size, other.size)
-                and (not taken_apart(photo, other) or _show_the_same([(photo, other)]))  # programs rewrite dates
+                and _is_copy(photo, other)
             ]
             if larger and photo.size != usual:
                 largest = max(larger, key=lambda other: other.width * other.height)
