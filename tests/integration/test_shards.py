@@ -95,6 +95,7 @@ def test_exposed_views_are_the_same_in_shards_and_where_a_file_is_compared(uncut
     of_tree = json.loads((measured.with_name("evaluation_lod_0") / "metrics.json").read_text())
     assert of_tree["psnr"] == pytest.approx(figures["psnr_reference_exposure"], abs=1e-9)
     assert of_tree["psnr_reference_exposure"] is None
+    assert json.loads((measured.with_name("evaluation_lod_0") / "status.json").read_text())["exposed"] is None
     assert_exposures_depart_from_one_exposure_for_all(open_run(run, "coarse"))
     done = vdgs("eval", run, "--views", "training")
     assert done.returncode == 0, done.stderr + done.stdout

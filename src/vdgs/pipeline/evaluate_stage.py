@@ -169,6 +169,11 @@ def evaluate_stage(
     else:
         peak = _evaluate_here(context, evaluation, console)
     record = measured_as(run, model.name, request.lpips_weights, request.visibility_bins)
+    if (
+        request.lod_error is not None
+        and read_json(evaluation.output / "metrics.json")["psnr_reference_exposure"] is None
+    ):
+        record["exposed"] = None  # a tree in the local exposure is measured in neutral colors
     status = record | {"seconds": time.monotonic() - start, "peak_memory_bytes": peak}
     write_json(evaluation.output / "status.json", status)
 
