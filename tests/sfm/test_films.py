@@ -241,6 +241,8 @@ def test_the_same_command_takes_no_frame_twice_and_other_films_are_refused(
         take(ask(output, film, num_frames=5))
     assert film_changes(output) == ""
     os.utime(film, (1, 1))
+    assert film_changes(output) == ""
+    film.write_bytes(film.read_bytes() + bytes(1))
     assert film_changes(output) == "films: 1 changed (a.mp4)"
     with pytest.raises(VdgsError, match=r"1 changed \(a.mp4\).*--overwrite"):
         take(ask(output, film))

@@ -127,7 +127,10 @@ def test_report_of_odm_becomes_a_capture_that_has_its_place(
         capture.ground.axes_origin,
     )
     assert np.abs(ecef_from_geodetic(places) - ecef(flight.centers)).max() < 1e-3
-    (root / "images" / flight.names[0]).touch()
+    first = root / "images" / flight.names[0]
+    first.touch()
+    ask(root, tmp_path / "capture")  # nothing to do
+    first.write_bytes(first.read_bytes() + bytes(1))
     with pytest.raises(VdgsError, match="--overwrite"):
         ask(root, tmp_path / "capture")
 

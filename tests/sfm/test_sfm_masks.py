@@ -20,6 +20,7 @@ from support.flights import HEIGHT, WIDTH, Flight, copy_folder, write_photograph
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_files import decode_mask
 from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import read_digests
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
@@ -241,7 +242,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     first = masked.folder / f"masks/{masked.names[0]}.png"
     for change in (lambda: None, lambda: write_mask(first, ~left_half(HEIGHT, WIDTH)), first.unlink):
         change()
-        keys.append(step_keys(plan_reconstruction(request)))
+        keys.append(step_keys(plan_reconstruction(request), read_digests(output)))
     for step in ("features", "matches", "model", "capture"):
         assert len({each[step] for each in keys}) == 3
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from support.next_commands import next_commands
-from vdgs.captures.reconstruction import PROGRESS_FILE, RECONSTRUCTION_FILE, STEPS_FILE, WORK_FOLDER
+from vdgs.captures.reconstruction import PROGRESS_FILE, RECONSTRUCTION_FILE, STEPS_FILE, WORK_FOLDER, read_digests
 from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
@@ -21,6 +23,7 @@ from vdgs.runs.run_settings import RunSettings
 from vdgs.sfm.run_request import make_sfm_request
 from vdgs.sfm.source_images import SourceImages, check_unchanged
 from vdgs.system.atomic_files import write_json
+from vdgs.system.content_digests import ContentDigests
 
 
 @pytest.fixture
@@ -37,7 +40,9 @@ def run(tmp_path, card) -> RunFolder:
     """A run whose photographs are being searched for features."""
     run = RunFolder(tmp_path / "my run")
     command = shlex.join(["vdgs", "run", str(card), "--output", str(run.path), "--preset", "laptop"])
-    SourceImages.of([card], command).write(run.own_capture)
+    digests = read_digests(run.own_capture)
+    SourceImages.of([card], digests, command).write(run.own_capture)
+    digests.write()
     write_json(run.own_capture / WORK_FOLDER / STEPS_FILE, {"begun": {"features": "1"}, "done": {}})
     progress = {"stage": "photographs", "step": "features", "unit": "photographs", "done": 2, "total": 6}
     times = {"seconds_left": 40.0, "later_seconds": 140.0}
@@ -85,7 +90,7 @@ def test_photographs_that_are_others_than_before_are_named_with_the_remedy(run, 
     assert status.of("photographs").reason == named
     (command,) = next_commands(next_line(status))
     assert command.endswith(" --overwrite")
-    now = SourceImages.of([card])
+    now = SourceImages.of([card], read_digests(run.own_capture))
     with pytest.raises(VdgsError, match=r"1 added \(DJI_9\.jpg\).*--overwrite"):
         check_unchanged(run.own_capture, now, overwrite=False)
     check_unchanged(run.own_capture, now, overwrite=True)
@@ -93,6 +98,34 @@ def test_photographs_that_are_others_than_before_are_named_with_the_remedy(run, 
         name.unlink()
     card.rmdir()  # the card was taken out: that says nothing
     assert full_run_status(run).of("photographs").state == "done"
+
+
+def test_photographs_that_were_copied_or_touched_are_the_same(run, card, tmp_path):
+    finish(run)
+    for file in card.iterdir():
+        os.utime(file, (1, 1))
+    assert full_run_status(run).of("photographs").state == "done"
+    copied = Path(shutil.copytree(card, tmp_path / "from the backup"))
+    check_unchanged(run.own_capture, SourceImages.of([copied], read_digests(run.own_capture)), overwrite=False)
+    file = copied / "DJI_3.jpg"
+    file.write_bytes(bytes(50) + b"1" + bytes(52))  # as many bytes as before
+    with pytest.raises(VdgsError, match=r"1 changed \(DJI_3\.jpg\)"):
+        check_unchanged(run.own_capture, SourceImages.of([copied], read_digests(run.own_capture)), overwrite=False)
+
+
+def test_a_file_is_read_again_only_where_its_size_or_time_is_another(card, tmp_path, monkeypatch):
+    record, files = tmp_path / "digests.json", sorted(card.iterdir())
+    first = ContentDigests.read(record)
+    found = first.of_all(files)
+    assert len(set(found.values())) == len(files)
+    first.write()
+    os.utime(files[0], (1, 1))
+    read, opened = list[Path](), Path.open
+    monkeypatch.setattr(Path, "open", lambda path, *args, **named: (read.append(path), opened(path, *args, **named))[1])
+    again = ContentDigests.read(record)
+    assert again.of_all(files) == found
+    assert [path for path in read if path in files] == files[:1]
+    assert again.of(tmp_path / "none.jpg") == ""
 
 
 def test_a_run_of_another_capture_has_no_photographs(run, tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json, read_json_or_empty
+from vdgs.system.content_digests import ContentDigests
 from vdgs.system.records import record_from_dict
 from vdgs.system.units import two_digits
 
@@ -23,6 +24,8 @@ STEPS_FILE = "steps.json"
 PROGRESS_FILE = "progress.json"
 #: The photographs that it is made of, in the capture.
 SOURCE_IMAGES_FILE = "photographs.json"
+#: The digests of what they hold, so that files are read again only where they may have changed.
+DIGESTS_FILE = "digests.json"
 #: The frames of films that it is made of, a folder for each film; and which films these are.
 FRAMES_FOLDER, FILMS_FILE = "frames", "films.json"
 #: The stage of a run that makes a capture of photographs, as `vdgs status` names it.
@@ -171,6 +174,11 @@ def is_finished(root: Path) -> bool:
     """Whether a capture that was begun here is placed, its last step."""
     done = read_json_or_empty(root / STEPS_FILE).get("done")
     return (root / RECONSTRUCTION_FILE).is_file() and isinstance(done, dict) and "placed" in done
+
+
+def read_digests(output: Path) -> ContentDigests:
+    """The digests of the photographs and masks of a capture that are known."""
+    return ContentDigests.read(output / DIGESTS_FILE)
 
 
 def read_reconstruction(root: Path) -> ReconstructionReport | None:

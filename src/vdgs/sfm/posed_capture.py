@@ -81,13 +81,14 @@ def make_posed_capture(
     if finished.is_done(CAPTURE, photographs.keys[CAPTURE]):
         console.print(f"{output}: made of these poses already; nothing to do", highlight=False)
         return
-    check_posed_output(request, photographs.keys)
+    check_posed_output(photographs)
     check_nothing_trained(request, run)
     console.print(
         f"{len(photographs.views)} photographs, poses and lenses as they are; points are found",
         highlight=False,
     )
     with writing(request, run):
+        photographs.digests.write()
         _find_features(photographs, work, request, threads, console)
         _match(photographs, work, request, threads, console)
         model = _triangulate(photographs, work, threads, console)
@@ -103,17 +104,18 @@ def make_posed_capture(
         console.print(f"{model.num_points3D():,} points, mean reprojection error {error:.2f} px", highlight=False)
 
 
-def check_posed_output(request: SfmRequest, keys: dict[str, str]) -> None:
+def check_posed_output(photographs: PosedPhotographs) -> None:
     """Raise VdgsError unless the output is a new folder, an empty one, or one that was begun with the same project."""
-    output = request.output
+    request, output = photographs.request, photographs.request.output
     work, finished = Workspace(output / WORK_FOLDER), Workspace(output)
     check_output(output)
     if not output.exists() or (output.is_dir() and not any(each.name != ".lock" for each in output.iterdir())):
         return
     begun = (work.path / STEPS_FILE).is_file() or (output / STEPS_FILE).is_file()
-    same = work.is_begun(FEATURES, keys[FEATURES]) or finished.is_begun(CAPTURE, keys[CAPTURE])
     if not begun:
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
+    keys = photographs.keys
+    same = work.is_begun(FEATURES, keys[FEATURES]) or finished.is_begun(CAPTURE, keys[CAPTURE])
     if not same and not request.overwrite:
         raise VdgsError(
             f"{output}: was begun with other photographs, poses or settings than there are now. Add --overwrite to "

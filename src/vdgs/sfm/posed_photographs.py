@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +20,7 @@ from vdgs.captures.georeference import Georef
 from vdgs.captures.image_files import pillow_without_limits, read_header
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.image_tags import kind_of
+from vdgs.captures.reconstruction import read_digests
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST, held_out_by_capture
 from vdgs.captures.tiff_orientation import without_orientation
 from vdgs.config.capture_options import CaptureOptions
@@ -26,6 +29,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, cache_key
 from vdgs.system.atomic_files import write_bytes
+from vdgs.system.content_digests import ContentDigests
 
 #: The steps of the work, and the folder of the features as the photographs show them.
 FEATURES, MATCHES, POINTS, CAPTURE, BENT = "features", "matches", "points", "capture", "bent"
@@ -39,12 +43,18 @@ class PosedPhotographs:
     views: tuple[MatchedView, ...]
     #: A camera for each size of photographs, whose numbers in COLMAP's database are 1, 2, ...
     pinholes: tuple[Intrinsics, ...]
-    keys: dict[str, str]
+    request: SfmRequest
+    digests: ContentDigests
     warnings: tuple[str, ...]
     on_white: bool = False
     """Whether what is transparent becomes white; else it is masked."""
     validation: frozenset[str] = frozenset()
     """Those that are kept for testing with `--validation` alone."""
+
+    @cached_property
+    def keys(self) -> dict[str, str]:
+        """What each step depends on. Reads the photographs where their digests are not known."""
+        return _keys(self)
 
     @property
     def is_data_set(self) -> bool:
@@ -93,16 +103,16 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
         warnings.append(f"{transparent} photographs are transparent: what is transparent {what}.")
     return PosedPhotographs(
         source=source, views=tuple(views), pinholes=_pinholes([view.file.intrinsics for view in views]),
-        keys=_keys(request, source, views, lists), warnings=(*source.warnings, *warnings),
+        request=request, digests=read_digests(request.output), warnings=(*source.warnings, *warnings),
         on_white=bool(on_white and transparent), validation=frozenset(lists.get(VALIDATION_LIST, ())),
     )  # fmt: skip
 
 
-def _keys(
-    request: SfmRequest, source: SourceCapture, views: Sequence[MatchedView], lists: Mapping[str, set[str]]
-) -> dict[str, str]:
-    files, lenses = [_fingerprint(view) for view in views], [view.file.intrinsics for view in views]
-    chosen = request.options
+def _keys(photographs: PosedPhotographs) -> dict[str, str]:
+    views, source, chosen = photographs.views, photographs.source, photographs.request.options
+    content = photographs.digests.of_all(path for view in views for path in _files(view))
+    files = [[view.view.name, *(content[path] for path in _files(view))] for view in views]
+    lenses = [view.file.intrinsics for view in views]
     found = cache_key(files, chosen.max_image_size, chosen.max_num_features)
     straight = cache_key(
         found, [vars(lens) for lens in lenses], [view.view.camera_from_world.tolist() for view in views]
@@ -110,7 +120,7 @@ def _keys(
     splits = [view.view.split for view in views]
     matched = cache_key(straight, chosen.num_neighbors, *([splits] if any(splits) else []))
     keys = {FEATURES: found, BENT: straight, MATCHES: matched, POINTS: matched}
-    validation = sorted(lists.get(VALIDATION_LIST, ()))
+    validation = sorted(photographs.validation)
     keys[CAPTURE] = cache_key(
         matched, chosen.max_output_size, source.georef and vars(source.georef), *([validation] if validation else [])
     )
@@ -171,9 +181,9 @@ def _pinholes(lenses: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
     return tuple(found)
 
 
-def _fingerprint(view: MatchedView) -> list[object]:
-    stats = [file.stat() for file in (view.file.path, view.file.mask) if file is not None]
-    return [view.view.name, *((stat.st_size, stat.st_mtime_ns) for stat in stats)]
+def _files(view: MatchedView) -> list[Path]:
+    """The photograph, and its mask if there is one."""
+    return [file for file in (view.file.path, view.file.mask) if file is not None]
 
 
 def write_on_white(photographs: PosedPhotographs, work: Workspace) -> None:

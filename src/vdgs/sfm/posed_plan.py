@@ -31,7 +31,7 @@ def plan_posed_capture(request: SfmRequest, options: CaptureOptions) -> tuple[Re
     an output that is something else."""
     check_ranges(request)
     photographs = read_posed_photographs(request, options)
-    check_posed_output(request, photographs.keys)
+    check_posed_output(photographs)
     images = ImageList(request.image_folders, tuple(_with_lenses(photographs)), (), 0, photographs.warnings)
     positions = _positions(photographs)
     plan = ReconstructionPlan(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,12 @@ from vdgs.captures.reconstruction import (
     RECONSTRUCTION_FILE,
     WORK_FOLDER,
     ReconstructionReport,
+    read_digests,
     read_reconstruction,
 )
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
-from vdgs.errors import RunError
+from vdgs.errors import RunError, VdgsError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import (
     capture_writer,
@@ -89,14 +90,16 @@ def reconstruct(
     silence_colmap()
     output = request.output
     request = with_frames(request, console, run)
-    prepared = plan_reconstruction(request)
-    work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared)
-    sources = SourceImages.of(request.image_folders, command)
+    prepared, digests = plan_reconstruction(request), read_digests(output)
+    work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared, digests)
+    sources = SourceImages.of(request.image_folders, digests, command)
     facts = read_reconstruction(output) if _is_finished(output, keys["placed"]) else None
     if facts is not None:
         console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
         if SourceImages.read(output) != sources:  # of files that are not used
             sources.write(output)
+        with suppress(VdgsError):  # it saves reading, and the folder may be read-only
+            digests.write()
         if not request.keep_intermediate:
             work.remove()
         return facts
@@ -106,6 +109,7 @@ def reconstruct(
     if before is not None:
         with writing(request, run):
             sources.write(output)
+            digests.write()
             facts = _place_anew(prepared, before, keys["placed"], console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
         print_reconstruction_report(facts, console)
@@ -118,6 +122,7 @@ def reconstruct(
         on_estimate(prepared, estimate)
     with writing(request, run):
         sources.write(output)
+        digests.write()
         if estimate is not None:
             work.remove()
             work.begin("features", keys["features"])

@@ -6,20 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vdgs.captures.reconstruction import SOURCE_IMAGES_FILE
+from vdgs.captures.reconstruction import SOURCE_IMAGES_FILE, read_digests
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.system.content_digests import ContentDigests
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.units import first_names
 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A photograph: its name in the capture, and what tells that its file was changed."""
+    """A photograph: its name in the capture, and the digest of its file."""
 
     name: str
-    file_bytes: int
-    mtime_ns: int
+    digest: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,12 +31,13 @@ class SourceImages:
     command: str | None = None
 
     @staticmethod
-    def of(folders: Sequence[Path], command: str | None = None) -> SourceImages:
+    def of(folders: Sequence[Path], digests: ContentDigests, command: str | None = None) -> SourceImages:
         """Those that lie in the folders now. Raises VdgsError where they cannot be told."""
         from vdgs.sfm.find_images import find_files  # reads pictures, which most runs do not need
 
-        stats = {name: path.stat() for name, path in find_files(folders).named.items()}
-        files = tuple(SourceFile(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats.items())
+        named = find_files(folders).named
+        found = digests.of_all(named.values())
+        files = tuple(SourceFile(name, found[path]) for name, path in named.items())
         return SourceImages(folders=tuple(str(each.resolve()) for each in folders), files=files, command=command)
 
     @staticmethod
@@ -70,7 +71,8 @@ def source_changes(output: Path) -> str:
     if films := film_changes(output):
         return films
     try:
-        return SourceImages.of([Path(folder) for folder in before.folders]).changes_since(before)
+        folders = [Path(folder) for folder in before.folders]
+        return SourceImages.of(folders, read_digests(output)).changes_since(before)
     except (VdgsError, OSError) as error:
         return f"photographs: cannot be compared ({error})"
 

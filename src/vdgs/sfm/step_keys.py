@@ -8,19 +8,21 @@ from vdgs import __version__
 from vdgs.sfm.image_metadata import RADIAL
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import cache_key
+from vdgs.system.content_digests import ContentDigests
 from vdgs.system.records import record_to_dict
 
 
-def step_keys(plan: ReconstructionPlan) -> dict[str, str]:
+def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, str]:
     """What each step depends on, each on those before it. All but the last do not depend on what places the scene."""
     options, positions = plan.request.options, plan.gps_priors
+    content = digests.of_all(photo.path for photo in plan.image_list.images)
     files = [
-        (photo.name, photo.file_bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
+        (photo.name, content[photo.path], photo.width, photo.height, photo.orientation)
         for photo in plan.image_list.images
     ]
     lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
     found = cache_key(
-        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan),
+        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan, digests),
         *_other_cameras(plan),
     )  # fmt: skip
     matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
@@ -39,11 +41,8 @@ def _other_cameras(plan: ReconstructionPlan) -> list[tuple[str, ...]]:
     return [each for each in said if each[1:] != (RADIAL, "", "")]
 
 
-def _masked_images(plan: ReconstructionPlan) -> list[tuple[Any, ...]]:
+def _masked_images(plan: ReconstructionPlan, digests: ContentDigests) -> list[tuple[Any, ...]]:
     """Photographs of which something may be left out, and what says so."""
     masked = [photo for photo in plan.image_list.images if photo.may_be_masked]
-    files = [photo.mask.stat() if photo.mask is not None else None for photo in masked]
-    return [
-        (photo.name, photo.has_alpha_channel, file and (file.st_size, file.st_mtime_ns))
-        for photo, file in zip(masked, files, strict=True)
-    ]
+    content = digests.of_all(photo.mask for photo in masked if photo.mask is not None)
+    return [(photo.name, photo.has_alpha_channel, photo.mask and content[photo.mask]) for photo in masked]

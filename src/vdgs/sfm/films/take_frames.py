@@ -5,7 +5,6 @@ Each film has a folder there; OUTPUT/films.json says which are finished. The sam
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from rich.markup import escape
 
 from vdgs.captures.name_resolution import to_colmap_name
 from vdgs.captures.output_guard import check_output
-from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER, SOURCE_IMAGES_FILE, WORK_FOLDER
+from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER, SOURCE_IMAGES_FILE, WORK_FOLDER, read_digests
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError, VdgsError
@@ -33,6 +32,7 @@ from vdgs.sfm.image_list import MIN_IMAGES
 from vdgs.sfm.reconstruction_plan import check_output_folder
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes, write_json
+from vdgs.system.content_digests import ContentDigests
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.stop_signals import check_stop_requested
@@ -49,18 +49,15 @@ class FilmRecord:
     """A film whose frames were taken."""
 
     film: str
-    file_bytes: int
-    mtime_ns: int
+    digest: str
+    """Of its file."""
     most: int
     """The bound on its frames."""
     frames: int
     summary: str
 
-    def is_of(self, film: Path, most: int) -> bool:
-        status = film.stat()
-        return (self.film, self.file_bytes, self.mtime_ns, self.most) == (
-            str(film.resolve()), status.st_size, status.st_mtime_ns, most,
-        )  # fmt: skip
+    def is_of(self, film: Path, digests: ContentDigests, most: int) -> bool:
+        return (self.film, self.digest, self.most) == (str(film.resolve()), digests.of(film), most)
 
 
 @contextmanager
@@ -99,7 +96,7 @@ def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = N
 def _check_same(request: SfmRequest, films: Sequence[Path]) -> None:
     """Raise VdgsError where the capture that is there was begun with other films or another bound on their frames."""
     before = _records(request.output)
-    changes = _changes(before, films)
+    changes = _changes(before, films, read_digests(request.output))
     if before and not changes:
         bounds = _bounds(films, request.options.num_frames)
         if sorted(record.most for record in before.values()) != sorted(bounds):
@@ -117,15 +114,15 @@ def film_changes(output: Path) -> str:
     there = [Path(record.film) for record in records]
     if not there or not all(film.is_file() for film in there):
         return ""
-    return _changes(_records(output), there)
+    return _changes(_records(output), there, read_digests(output))
 
 
-def _changes(before: Mapping[str, FilmRecord], films: Sequence[Path]) -> str:
+def _changes(before: Mapping[str, FilmRecord], films: Sequence[Path], digests: ContentDigests) -> str:
     known, now = {record.film: record for record in before.values()}, {str(film.resolve()): film for film in films}
     same = known.keys() & now.keys()
     kinds = {
         "added": now.keys() - known.keys(), "removed": known.keys() - now.keys(),
-        "changed": {name for name in same if not known[name].is_of(now[name], known[name].most)},
+        "changed": {name for name in same if not known[name].is_of(now[name], digests, known[name].most)},
     }  # fmt: skip
     parts = [
         f"{len(names)} {kind} ({first_names(sorted(Path(name).name for name in names))})"
@@ -153,13 +150,15 @@ def _take(request: SfmRequest, output: Path, console: Console) -> tuple[Path, ..
         if rest.is_dir() and rest.name not in names:
             shutil.rmtree(rest)
     bounds = dict(zip(names, zip(films, most, strict=True), strict=True))
-    records = {name: record for name, record in before.items() if name in names and record.is_of(*bounds[name])}
-    records = {name: record for name, record in records.items() if (folder / name).is_dir()}
+    digests, kept = read_digests(output), [name for name in before if name in names and (folder / name).is_dir()]
+    records = {name: before[name] for name in kept if before[name].is_of(bounds[name][0], digests, bounds[name][1])}
     _write_records(output, records)
     for name, (film, bound) in bounds.items():
         if name not in records:
-            records[name] = _take_frames(film, folder / name, bound, Workspace(output / WORK_FOLDER), console)
+            taken = _take_frames(film, folder / name, bound, Workspace(output / WORK_FOLDER), console)
+            records[name] = replace(taken, digest=digests.of(film))
             _write_records(output, records)
+            digests.write()
         known = records[name]
         console.print(escape(f"{film.name}: {known.summary}"), highlight=False)
     count = sum(record.frames for record in records.values())
@@ -203,7 +202,7 @@ def _bounds(films: Sequence[Path], total: int) -> list[int]:
 def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: Console) -> FilmRecord:
     """Write the frames of a film that are chosen, then what is known of each into the files."""
     shutil.rmtree(folder, ignore_errors=True)
-    moments, stat = dict[Path, float](), path.stat()
+    moments = dict[Path, float]()
 
     def keep(frame: FilmFrame) -> Path:
         file = folder / f"{folder.name}_{frame.number:06d}.jpg"
@@ -223,12 +222,8 @@ def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: 
             placed += known.lat_lon is not None
             moment = _moment(film, records, known, moments[file])
             write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
-            os.utime(file, ns=(stat.st_mtime_ns, stat.st_mtime_ns))  # frames that are taken again are no others
         summary = _summary(film, len(chosen), placed, last, records, source)
-    return FilmRecord(
-        film=str(path.resolve()), file_bytes=stat.st_size, mtime_ns=stat.st_mtime_ns, most=most, frames=len(chosen),
-        summary=summary,
-    )  # fmt: skip
+    return FilmRecord(film=str(path.resolve()), digest="", most=most, frames=len(chosen), summary=summary)
 
 
 def _look(film: Film, chooser: FrameChooser[FilmFrame], tell) -> FilmFrame:  # type: ignore[no-untyped-def]
