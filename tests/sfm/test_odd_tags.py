@@ -184,6 +184,8 @@ def test_void_positions_and_altitudes_of_flat_fixes_are_not_used_unless_the_tag_
         ("World Geodetic System 1984", (35.6, 139.7), 0, 0),
         ("EPSG:4326", (35.6, 139.7), 0, 0),
         ("IGS14", (35.6, 139.7), 0, 0),
+        ("SWEREF 99", (59.0, 18.0), 0, 0),
+        ("RGF93", (46.0, 2.0), 0, 0),
         ("TOKYO", (35.6, 139.7), 460, 9),
         ("NAD 27", (40.0, -100.0), 35, 7),
         ("S-42", (55.0, 37.0), 120, 3),

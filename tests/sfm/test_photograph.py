@@ -94,6 +94,9 @@ def test_rtk_says_how_accurate_it_is(tmp_path):
     seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), xmp=xmp) for k in range(3)]
     assert positions_of(seen).gps_std[0] == pytest.approx([0.012, 0.015, 0.03])
     assert positions_of([replace(each, gps_std=None) for each in seen]).gps_std[0] == pytest.approx([1, 1, 2])
+    for flag, std in ((50, [0.012, 0.015, 0.03]), (16, [1, 1, 2]), (0, [1, 1, 2])):
+        seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), xmp=f'{xmp} drone-dji:RtkFlag="{flag}"') for k in range(3)]
+        assert positions_of(seen).gps_std[0] == pytest.approx(std)
 
 
 def test_exif_says_how_accurate_a_phone_is_where_rtk_does_not(tmp_path):

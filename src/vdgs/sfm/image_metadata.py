@@ -124,6 +124,8 @@ MIN_SIDE_PX = 100
 TRANSPOSED_ORIENTATIONS = (5, 6, 7, 8)
 #: A receiver that is off by more has no position.
 MAX_GPS_ERROR_M = 1000.0
+#: DJI's RtkFlag of no position and of one without corrections, whose error is at least so many metres.
+NOT_CORRECTED, UNCORRECTED_M = (0.0, 16.0), 0.3
 #: COLMAP's models of lenses that a photograph may ask for.
 RADIAL, FISHEYE = "SIMPLE_RADIAL", "OPENCV_FISHEYE"
 #: The model of cameras of which nothing is fitted: of views that were cut out of panoramas.
@@ -360,11 +362,13 @@ def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[st
 
 
 def _stated_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
-    """What the receiver says: DJI's RTK, or Pix4D's names, which makers of wings and of multispectral cameras write."""
+    """What the receiver says: DJI's RTK, or Pix4D's names, which makers of wings and of multispectral cameras write.
+    Centimetres of a receiver that had no corrections are those of an earlier moment."""
     across, upwards = "Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"
     names = (("RtkStdLon", across), ("RtkStdLat", across), ("RtkStdHgt", upwards))
     found = [first_number(xmp, *each) for each in names]
-    east, north, up = (value if value is not None and 0 < value < 100 else None for value in found)
+    least = UNCORRECTED_M if first_number(xmp, "RtkFlag") in NOT_CORRECTED else 0.0
+    east, north, up = (value if value is not None and least < value < 100 else None for value in found)
     return None if east is None or north is None or up is None else (east, north, up)
 
 

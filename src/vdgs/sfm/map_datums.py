@@ -15,6 +15,7 @@ from vdgs.sfm.exif_gps import Place, plain_text
 #: Datums that agree with WGS 84 to a metre or two.
 _GLOBAL = re.compile(
     r"WGS[-_ ]*(19)?84|ITRF|ETRS|JGD|CGCS|GDA|NAD[-_ ]*(19)?83|SIRGAS|PZ[-_ ]*90|GRS[-_ ]*(19)?80|KGD|NZGD[-_ ]*20"
+    r"|RGF[-_ ]*93|SWEREF[-_ ]*99|ETRF|EUREF|REGCAN[-_ ]*95|HARTEBEESTHOEK[-_ ]*94|POSGAR|MAGNA|TWD[-_ ]*97|CSRS|^GPS$"
     r"|IGS[-_ ]?\d|\bWG?S?84\b|WORLD GEODETIC SYSTEM([-_ ]*OF)?[-_ ]*(19)?84|^(EPSG:*)?(4326|4979)$",
     re.I,
 )
