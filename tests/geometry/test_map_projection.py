@@ -1,6 +1,7 @@
 """Coordinates on the map: exact, invertible, with the right north, and refused where nobody knows them."""
 
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -53,6 +54,24 @@ def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
     x, y = pyproj.Proj(placement.crs)(longitude, latitude)
     np.testing.assert_allclose(placement.project(points), np.stack([x, y, height], axis=1), rtol=0, atol=1e-6)
     assert pyproj.CRS.from_wkt(placement.wkt).to_epsg() == int(placement.crs[5:])
+
+
+@pytest.mark.parametrize("crs", ["EPSG:2100", "EPSG:5514", "EPSG:27700"])
+def test_beside_its_country_a_system_keeps_its_datum_shift_and_says_so(crs):
+    """As pyproj does, which takes the best operation of those that its catalogue has, wherever it is made for."""
+    placement = MapProjection.of(frame(), crs)
+    assert any("datum shift that is made for" in note for note in placement.notes)
+    points = scattered()
+    latitude, longitude, height = geodetic_from_enu(points, BERN).T
+    with warnings.catch_warnings():  # of grids that are not at hand
+        warnings.simplefilter("ignore", UserWarning)
+        ways = pyproj.transformer.TransformerGroup("EPSG:4979", crs, always_xy=True).transformers
+    near = min(
+        np.abs(placement.project(points)[:, :2] - np.stack(way.transform(longitude, latitude, height)[:2], 1)).max()
+        for way in ways
+        if "ballpark" not in way.description.lower()
+    )
+    assert near < 0.01
 
 
 def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_map():

@@ -142,22 +142,46 @@ def _operation(crs: Any, code: str, origin: tuple[float, float, float]) -> tuple
     missing = f" It needs {' or '.join(grids[:3])}: `projsync --file NAME` fetches one." if grids else ""
     if not group.transformers:
         raise VdgsError(f"--crs {code}: PROJ knows no way from WGS 84 to {crs.name}.{missing} Give another system.")
-    found = group.transformers[0]
-    if len(crs.axis_info) == 3 and not crs.is_geocentric and "ballpark" in found.description.lower():
+    found, elsewhere = group.transformers[0], False
+    if _is_ballpark(found) and (shift := _datum_shift(crs)) is not None:
+        found, elsewhere = shift, True
+    if len(crs.axis_info) == 3 and not crs.is_geocentric and _is_ballpark(found):
         vertical = crs.sub_crs_list[-1].name if crs.is_compound else crs.axis_info[2].name
         raise VdgsError(
             f"--crs {code}: its heights ({vertical}) cannot be had from heights above the ellipsoid here.{missing} Or "
             f"give the system without heights, {code.partition('+')[0]}."
         )
     notes = []
-    if "ballpark" in found.description.lower():
-        notes.append(f"{crs.name} is reached without a datum shift: coordinates may be off by some metres.{missing}")
+    if elsewhere:
+        area_name = found.area_of_use.name if found.area_of_use else "elsewhere"
+        notes.append(
+            f"{crs.name} is reached by a datum shift that is made for {area_name}; here it may be off by metres."
+        )
+    elif _is_ballpark(found):
+        notes.append(
+            f"{crs.name} is reached without a datum shift: coordinates may be off by hundreds of metres.{missing}"
+        )
     elif not group.best_available:
         notes.append(f"{crs.name} is reached to about {found.accuracy:g} m, its best operation is missing.{missing}")
     use = crs.area_of_use
     if use is not None and not _inside(latitude, longitude, use):
         notes.append(f"{crs.name} is made for {use.name}; this place lies outside, and lengths are distorted.")
     return found, tuple(notes)
+
+
+def _is_ballpark(operation: Any) -> bool:
+    """Whether PROJ takes latitude and longitude for those of the other datum."""
+    return "ballpark" in operation.description.lower()
+
+
+def _datum_shift(crs: Any) -> Any | None:
+    """The best way from WGS 84 to a system wherever it is made for, with a datum shift; None where PROJ has none."""
+    from pyproj.transformer import TransformerGroup
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        ways = TransformerGroup("EPSG:4979", crs, always_xy=True).transformers
+    return next((way for way in ways if not _is_ballpark(way)), None)
 
 
 def _inside(latitude: float, longitude: float, use: Any) -> bool:
