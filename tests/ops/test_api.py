@@ -399,6 +399,7 @@ def test_a_capture_in_a_shell_is_a_line_and_its_views_have_no_arrays_of_observat
 
 def test_wrong_kinds_of_arguments_are_named(capture, coarse):
     points, cameras = capture.points, coarse.cameras
+    blocks = vdgs.partition(points, np.full(len(points), 5), num_blocks=2)
     for call, name in (
         (lambda: vdgs.count_visibility(points, capture), "cameras must be .*Sequence, not Capture: of a capture take"),
         (lambda: vdgs.visibility_ratio(points, capture.train_views), "cameras must be vdgs.Camera, not View"),
@@ -408,7 +409,11 @@ def test_wrong_kinds_of_arguments_are_named(capture, coarse):
         (lambda: vdgs.render(coarse, capture.views[0]), "camera must be vdgs.Camera, not View"),
         (lambda: vdgs.assign_cameras(points, None, cameras), "scene must be vdgs.Scene"),
         (lambda: vdgs.export(points, "x.ply"), "scene must be vdgs.Scene"),
-        (lambda: vdgs.assign_cameras(coarse, None, cameras, {}), "config must be vdgs.AssignmentConfig, not dict"),
+        (lambda: vdgs.assign_cameras(coarse, None, cameras), "blocks must be vdgs.Blocks, not NoneType"),
+        (lambda: vdgs.merge(coarse, [points], None, None), "scene must be vdgs.Scene, not ndarray"),
+        (lambda: vdgs.merge(coarse, [coarse], [], None), "blocks must be vdgs.Blocks, not list: vdgs.partition makes"),
+        (lambda: vdgs.merge(coarse, [coarse], blocks, None), "assignment must be vdgs.Assignment, not NoneType"),
+        (lambda: vdgs.assign_cameras(coarse, blocks, cameras, {}), "config must be vdgs.AssignmentConfig, not dict"),
         (lambda: vdgs.train(capture, {"iterations": 3}), "config must be vdgs.MethodConfig or vdgs.TrainConfig, not d"),
         (lambda: vdgs.train(capture, callbacks=print), "callbacks must be .*Iterable, not builtin.*: give a list of"),
         (lambda: vdgs.train(capture, callbacks=[3]), "each of callbacks must be .*Callable, not int"),

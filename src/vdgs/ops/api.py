@@ -301,6 +301,7 @@ def assign_cameras(
     from vdgs.partition.assignment.score_matrix import compute_score_matrix
 
     _check_scene(scene)
+    check_kind("blocks", blocks, Blocks, remedy="vdgs.partition makes them")
     check_cameras(cameras)
     config = _checked_config("config", AssignmentConfig() if config is None else config, AssignmentConfig)
     decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
@@ -319,10 +320,15 @@ def merge(
     """One scene from trained blocks: every place takes its anchors from exactly one block.
 
     `scene` is the coarse scene that the blocks were trained from; the rows of `assignment` are its training cameras.
-    Raises VdgsError for blocks of another coarse scene or in another order, ValueError where the numbers do not fit.
+    Raises VdgsError for blocks of another coarse scene or in another order, ValueError where the numbers do not fit,
+    TypeError for arguments of another kind.
     """
     from vdgs.partition.merging import merge_blocks
 
+    for each in (scene, *block_scenes):
+        _check_scene(each)
+    check_kind("blocks", blocks, Blocks, remedy="vdgs.partition makes them")
+    check_kind("assignment", assignment, Assignment, remedy="vdgs.assign_cameras makes it")
     settings, cameras = checked_settings(MergeConfig, {"rule": rule}, "merge"), scene.cameras
     if assignment.cameras.shape != (len(cameras), len(blocks)):
         raise ValueError(
