@@ -103,6 +103,7 @@ def test_a_run_that_is_there_keeps_its_settings(tmp_path):
         ("- 1", "holds no settings"),
         ("vdgs: {iterations: 5}", "vdgs has no 'iterations'"),
         ("training: [", "cannot be read as YAML"),
+        ("training:\n\titerations: 5", "cannot be read as YAML (line 2, column 1: found character"),
         ("training: {iterations: 5, seed: 1, iterations: 6}", "iterations is given twice"),
         ("training: {iterations: 30.000}", "write such as 30000, 30k"),
     ],

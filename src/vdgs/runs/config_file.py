@@ -105,7 +105,7 @@ class ConfigFile:
         try:
             return _parse_settings(self.path, self.path.read_text(encoding="utf-8-sig"))
         except UnicodeDecodeError as error:
-            raise RunError(f"{self.path}: is damaged, not valid YAML ({error})") from error
+            raise RunError(f"{self.path}: is damaged, not valid YAML ({yaml_fault(error)})") from error
 
 
 @lru_cache(maxsize=4)
@@ -115,7 +115,7 @@ def _parse_settings(path: Path, text: str) -> RunSettings:
     try:
         settings = load_yaml(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise RunError(f"{path}: is damaged, not valid YAML ({error})") from error
+        raise RunError(f"{path}: is damaged, not valid YAML ({yaml_fault(error)})") from error
     missing = [name for name in SECTIONS if not isinstance(settings, dict) or name not in settings]
     if missing:  # a part of a file may be YAML too: defaults in place of the rest would train another scene
         raise RunError(
@@ -176,6 +176,13 @@ class _Loader(yaml.SafeLoader):
 
 _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
+
+def yaml_fault(error: Exception) -> str:
+    """What is wrong with a text, and where: line 2, column 1: found character '\\t' that cannot start any token."""
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None)
+    return f"line {mark.line + 1}, column {mark.column + 1}: {problem}" if mark and problem else str(error)
 
 
 def load_yaml(text: str) -> Any:

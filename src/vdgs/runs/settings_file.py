@@ -16,7 +16,7 @@ from vdgs.config.options import Values, field_help, with_values
 from vdgs.config.ranges import check_ranges
 from vdgs.config.serialization import flat_values, to_dict
 from vdgs.errors import VdgsError
-from vdgs.runs.config_file import load_yaml
+from vdgs.runs.config_file import load_yaml, yaml_fault
 from vdgs.system.atomic_files import write_text
 
 HEADER = """\
@@ -37,7 +37,7 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
     try:
         content = load_yaml(decode_text(path.read_bytes())) or {}
     except (OSError, yaml.YAMLError, RecursionError, ValueError) as error:
-        raise VdgsError(f"{path}: cannot be read as YAML ({error})") from error
+        raise VdgsError(f"{path}: cannot be read as YAML ({yaml_fault(error)})") from error
     if not isinstance(content, Mapping):
         raise VdgsError(f"{path}: holds no settings. Write a file to start from: vdgs config --output settings.yaml")
     sections = {key: value for key, value in content.items() if key != "vdgs"}
