@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
 import torch
 
 from support.block_training import block_stage
@@ -11,8 +13,8 @@ from support.checkerboard import Photographs
 from vdgs.config.method import BlockConfig, DensifyConfig, LossConfig
 from vdgs.kernels.kernel_types import Raster, TrainingSplats
 from vdgs.model.renderer import render
-from vdgs.training import train
-from vdgs.training.depth_agreement import MIN_ALPHA, SMOOTH_BELOW, depth_agreement
+from vdgs.training import train, training_loop
+from vdgs.training.depth_agreement import MIN_ALPHA, SMOOTH_BELOW, DepthAgreement, depth_agreement
 from vdgs.training.target import opacity_factors_at
 from vdgs.training.training_step import render_for_training
 
@@ -46,6 +48,24 @@ def test_training_with_it_draws_splats_to_one_depth() -> None:
         return float(depth_agreement(render(model, Photographs().camera(0), depth=True), stage.camera_height).loss)
 
     assert spread(1.0) < 0.7 * spread(0.0)
+
+
+def test_every_second_step_counts_it_twice_and_the_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    def one(raster: Raster, _: float) -> DepthAgreement:
+        return DepthAgreement(torch.tensor(1.0), torch.zeros_like(raster.alpha), torch.zeros_like(raster.alpha))
+
+    def losses(weight: float) -> list[float]:
+        stage, state = block_stage(BlockConfig())
+        stage, found = (
+            replace(stage, config=replace(stage.config, loss=LossConfig(depth_agreement=weight))),
+            list[float](),
+        )
+        train(state, stage, stop=lambda: len(found) == 4, after_step=lambda _, step: found.append(step.loss))
+        return found
+
+    monkeypatch.setattr(training_loop, "depth_agreement", one)
+    more = np.subtract(losses(0.25), losses(0.0))
+    assert more == pytest.approx([0.5, 0.0, 0.5, 0.0], abs=1e-6)
 
 
 def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:

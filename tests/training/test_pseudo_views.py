@@ -17,7 +17,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.renderer import render
 from vdgs.training import TrainingProblem, TrainingState, from_checkpoint, initial_state, to_checkpoint, train
-from vdgs.training.pseudo_views import MAX_DIFFERENCE, MAX_TILT, NEARER, pseudo_camera, warp_photograph
+from vdgs.training.pseudo_views import MAX_DIFFERENCE, MAX_TILT, NEARER, SIZE, pseudo_camera, warp_photograph
 from vdgs.training.target import TrainingTarget
 from vdgs.training.training_loop import PSEUDO_STREAM, pseudo_step
 
@@ -57,6 +57,8 @@ def test_pseudo_views_look_at_a_place_of_the_photograph_from_nearer_and_more_til
         near = np.linalg.norm(found.position - middle) / np.linalg.norm(camera.position - middle)
         assert NEARER[0] <= near <= NEARER[1]
         assert found.camera_from_world[0, 2] == pytest.approx(0.0)  # the horizon is level
+        assert found.width / found.fx == pytest.approx(camera.width / camera.fx)  # as wide a view, in fewer pixels
+        assert found.width == round(SIZE * camera.width)
         tilts.append(math.degrees(math.acos(-found.forward[2])))
     assert max(tilts) < MAX_TILT
     assert np.ptp(tilts) > 15

@@ -13,8 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vdgs.config.method import TrainConfig
 from vdgs.kernels.kernel_types import Raster
 
+#: So many steps from one with this loss to the next, in which it weighs as much as in all of them together: depths cost
+#: an eighth of a step.
+EVERY = 2
 #: Pixels less opaque than this have no surface.
 MIN_ALPHA = 0.5
 #: Below this difference (camera heights) the loss is quadratic.
@@ -27,6 +31,11 @@ class DepthAgreement(NamedTuple):
     loss: Float[Tensor, ""]
     alpha: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"]
+
+
+def is_agreement_due(config: TrainConfig, iteration: int) -> bool:
+    """Whether iteration (from 0) compares depths."""
+    return config.loss.depth_agreement > 0 and iteration % EVERY == 0
 
 
 @torch.no_grad()

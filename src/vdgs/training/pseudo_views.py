@@ -24,6 +24,8 @@ from vdgs.training.target import TrainingTarget
 
 #: Every so many steps draw a pseudo view, after this share of the iterations: before it depths are vague.
 EVERY, START_FRACTION = 5, 0.3
+#: Its width and height, in those of the photograph, which tells no more of a place that is nearer.
+SIZE = 0.7
 #: In degrees: by how much more a pseudo view is tilted than its photograph, and up to what tilt; how far it is turned
 #: about its place to either side, and below what tilt of the photograph by any angle. Then its distance from the place,
 #: in those of the photograph. From nearer and with more tilt photographs tell too little (reports/off-path.md).
@@ -64,7 +66,10 @@ def pseudo_camera(camera: Camera, raster: Raster, rng: np.random.Generator) -> C
     tilt = math.radians(min(tilt + rng.uniform(0, MORE_TILT), max(tilt, MAX_TILT)))
     away = np.array([math.cos(heading) * math.sin(tilt), math.sin(heading) * math.sin(tilt), math.cos(tilt)])
     pose = _looking_at(middle + distance * rng.uniform(*NEARER) * away, middle, heading)
-    return replace(camera, camera_from_world=pose, cx=camera.width / 2, cy=camera.height / 2, uncropped_size=None)
+    smaller = camera.resized(*(max(1, round(SIZE * side)) for side in (camera.width, camera.height)))
+    return replace(
+        smaller, camera_from_world=pose, cx=smaller.width / 2, cy=smaller.height / 2, uncropped_size=None
+    )  # fmt: skip
 
 
 def _looking_at(position: np.ndarray, middle: np.ndarray, heading: float) -> np.ndarray:

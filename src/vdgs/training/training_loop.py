@@ -24,7 +24,8 @@ from vdgs.kernels.transfer import is_host
 from vdgs.model.renderer import cull_anchors, decode_anchors_for_training
 from vdgs.model.scale_bounds import MAX_OFFSET_FACTOR
 from vdgs.training.densification_step import densify, sort_morton
-from vdgs.training.depth_agreement import DepthAgreement, depth_agreement
+from vdgs.training.depth_agreement import EVERY as AGREEMENT_EVERY
+from vdgs.training.depth_agreement import DepthAgreement, depth_agreement, is_agreement_due
 from vdgs.training.exposure_centering import center_exposures, count_exposure
 from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.optimizer import learning_rates_at
@@ -100,7 +101,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
         target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
         frozen = _frozen_splats(stage, view, camera, target.camera, iteration)
         drawn = render_for_training(
-            splats, target.camera, background, frozen, depth=with_pseudo_view or bool(config.loss.depth_agreement),
+            splats, target.camera, background, frozen, depth=with_pseudo_view or is_agreement_due(config, iteration),
             opacity_factors=opacity_factors_at(stage, iteration, len(splats.source)),
         )  # fmt: skip
     drawn = with_sky(drawn, stage, view, state.decoder, target.camera, background)
@@ -109,7 +110,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    if (agreement := _weighted_agreement(drawn, stage, target.valid_fraction)) is not None:
+    if (agreement := _weighted_agreement(drawn, stage, iteration, target.valid_fraction)) is not None:
         loss = loss + agreement.loss
     values = torch.stack([loss, compared.l1, compared.ssim])
     if is_host(values):  # before anything moves
@@ -237,11 +238,11 @@ def image_index_at(stage: TrainingProblem, view: int) -> int:
 
 
 def _weighted_agreement(
-    drawn: RenderedTrainingView, stage: TrainingProblem, valid_fraction: float
+    drawn: RenderedTrainingView, stage: TrainingProblem, iteration: int, valid_fraction: float
 ) -> DepthAgreement | None:
-    """The loss of depths and its gradients, scaled to the whole photograph; None where it has no weight."""
-    weight = stage.loss_weight * stage.config.loss.depth_agreement * valid_fraction
-    if not weight or not len(drawn.source):
+    """The loss of depths and its gradients, scaled to the whole photograph; None where none is due."""
+    weight = AGREEMENT_EVERY * stage.loss_weight * stage.config.loss.depth_agreement * valid_fraction
+    if not (weight and is_agreement_due(stage.config, iteration) and len(drawn.source)):
         return None
     return DepthAgreement(*(weight * part for part in depth_agreement(drawn.raster, stage.camera_height)))
 
