@@ -25,8 +25,10 @@ from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images, is_image_folder
 from vdgs.sfm.image_metadata import UnusableImage, read_image_metadata
 from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.mask_files import apply_orientation
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.workspace import Workspace
+from vdgs.system.lazy_pycolmap import pycolmap
 
 COUNT = 6
 
@@ -362,6 +364,32 @@ def test_what_is_done_with_other_kinds_is_said(tmp_path):
     shown = decode_image(workspace.images / "R_0.DNG")[0]
     off = np.abs(shown.astype(int) - np.rot90(pixels(0), -1))
     assert off[20:-20, 20:-20].mean() < 12  # the sensor has one color of three at each pixel
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_colmap_gets_pixels_of_every_format_that_is_read(tmp_path, orientation):
+    """By the content of a file: COLMAP's decoder finds nothing in some formats, and reads others black."""
+    tags = Image.Exif()
+    tags[0x0112] = orientation
+    formats = {
+        "a.webp": {"lossless": True}, "webp.jpg": {"format": "WEBP", "lossless": True}, "gif.png": {"format": "GIF"},
+        "jpeg2000.tif": {"format": "JPEG2000"}, "zstd.tif": {"compression": "zstd"},
+        "lzma.tif": {"compression": "lzma"}, "lzw.tif": {"compression": "tiff_lzw"},
+        "jpeg.tif": {"compression": "jpeg", "quality": 98}, "named.webp": {"format": "JPEG", "quality": 98},
+        "plain.tif": {}, "b.png": {}, "c.bmp": {}, "png.jpg": {"format": "PNG"},
+    }  # fmt: skip
+    for k, (name, how) in enumerate(formats.items()):
+        picture(tmp_path / "in" / name, cv2.GaussianBlur(pixels(k), (0, 0), 4), exif=tags, **how)
+    found = collect_images([tmp_path / "in"])
+    assert {each.name for each in found.images} == formats.keys()
+    assert "WebP; converted to 8-bit sRGB and written as JPEG (a.webp.jpg)" in " ".join(found.notes)
+    assert "zstd.tif: TIFF compressed by zstd; converted" in " ".join(found.notes)
+    workspace = Workspace(tmp_path / "work")
+    assert not write_upright_images(workspace, found.images)
+    for photo in found.images:
+        seen = pycolmap.Bitmap.read(str(workspace.images / photo.name), True).to_array()
+        shown = apply_orientation(decode_image(photo.path)[0], photo.orientation)
+        assert np.abs(seen.astype(int) - shown).mean() < 2, photo.name
 
 
 # ---------------------------------------------------------------------------------------------- ends of JPEGs

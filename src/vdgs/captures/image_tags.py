@@ -17,6 +17,11 @@ from vdgs.captures.tiff_orientation import stored_size
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
 _BITS_PER_SAMPLE = 0x0102
+#: Pillow's formats that all programs read, COLMAP's decoder among them, and the compressions of TIFF that every build
+#: of libtiff has. Of others COLMAP finds nothing, or reads black.
+_COMMON_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")
+_COMMON_COMPRESSIONS = ("raw", "packbits", "tiff_lzw", "tiff_deflate", "tiff_adobe_deflate", "jpeg")
+_NAMES = {"HEIF": "HEIC", "WEBP": "WebP"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +41,8 @@ class ImageTags:
     whole: bool
     """False for a JPEG without an end marker."""
     kind: str
-    """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, raw, CMYK, Display P3, 16 bits a
-    channel; empty for what is."""
+    """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, WebP, raw, CMYK, Display P3, 16 bits
+    a channel; empty for what is."""
 
 
 def read_tags(path: Path) -> ImageTags:
@@ -76,10 +81,18 @@ def kind_of(path: Path) -> str:
 
 
 def _kind(image: Image.Image) -> str:
-    parts = [image.format] if image.format in ("HEIF", "AVIF") else []
     space = foreign_space(image)
-    parts += [space] if space else ["16 bits a channel"] if _has_16_bits(image) else []
-    return ", ".join(parts).replace("HEIF", "HEIC")
+    colors = space or ("16 bits a channel" if _has_16_bits(image) else "")
+    return ", ".join(filter(None, (_uncommon_format(image), colors)))
+
+
+def _uncommon_format(image: Image.Image) -> str:
+    """The format by its content, whatever its name ends in, where not all programs read it."""
+    found = image.format or ""
+    if found not in _COMMON_FORMATS:
+        return _NAMES.get(found, found)
+    compression = str(image.info.get("compression", "raw")) if found == "TIFF" else "raw"
+    return "" if compression in _COMMON_COMPRESSIONS else f"TIFF compressed by {compression.removeprefix('tiff_')}"
 
 
 def _has_16_bits(image: Image.Image) -> bool:
