@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from vdgs.captures.jpeg import lacks_only_end
 from vdgs.captures.strays import walk
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
+from vdgs.sfm.cross_checks import strays
 from vdgs.sfm.feature_extraction import write_upright_images
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images, is_image_folder
@@ -212,6 +214,28 @@ def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
         f"{folder}/{n}" for folder in ("other_camera", "z") for n in names
     ]
     assert all(f"another version of z/{each.name[-12:]}" in each.reason for each in found.excluded)
+
+
+@pytest.mark.parametrize("counted", ["20260601_100000-1", "20260601_100000(0)", "20260601_100000_1"])
+@pytest.mark.parametrize("subseconds", [None, ("000", "500")])
+def test_photographs_of_one_second_are_no_copies_of_each_other(tmp_path, counted, subseconds):
+    """Cameras and programs that name photographs by their second count those of one; what is downloaded twice shows the
+    same."""
+    shown = [pixels(0), np.roll(pixels(0), 40, axis=1), pixels(0)]
+    for name, each, part in zip(("20260601_100000", counted, "20260601_100000 (3)"), shown, (0, 1, 0), strict=True):
+        write_photograph(tmp_path / f"{name}.jpg", each, 0, np.array([0.0, 0.0, 40.0]))
+        with Image.open(tmp_path / f"{name}.jpg") as image:
+            exif = image.getexif()
+        if subseconds:
+            exif.get_ifd(0x8769)[0x9291] = subseconds[part]
+        picture(tmp_path / f"{name}.jpg", each, exif=exif, quality=90 + part)
+    found = {photo.name: photo for photo in (read_image_metadata(file, file.name) for file in tmp_path.iterdir())}
+    reasons, _ = strays([*found.values()])
+    assert [*reasons] == ["20260601_100000 (3).jpg"]
+    if subseconds:  # those of which both say it differ, whatever they show
+        same = replace(found[f"{counted}.jpg"], path=found["20260601_100000.jpg"].path)
+        assert not strays([found["20260601_100000.jpg"], same])[0]
+        assert strays([found["20260601_100000.jpg"], replace(same, subsecond=0.0)])[0]
 
 
 def test_raw_files_in_a_folder_beside_their_pictures_are_left_out(tmp_path):
