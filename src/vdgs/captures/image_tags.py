@@ -13,9 +13,9 @@ from vdgs.captures.image_files import mode_of, open_image
 from vdgs.captures.jpeg import JPEGS, has_end
 from vdgs.captures.raw_files import is_raw, raw_size, raw_tags
 from vdgs.captures.tiff_orientation import stored_size
+from vdgs.captures.xmp_packets import exif_of, xmp_of
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
 _BITS_PER_SAMPLE = 0x0102
 #: Pillow's formats that all programs read, COLMAP's decoder among them, and the compressions of TIFF that every build
 #: of libtiff has. Of others COLMAP finds nothing, or reads black.
@@ -37,6 +37,7 @@ class ImageTags:
     details: dict[int, Any]
     gps: dict[int, Any]
     xmp_packet: bytes
+    """All packets, one behind the other."""
     has_alpha_channel: bool
     whole: bool
     """False for a JPEG without an end marker."""
@@ -56,7 +57,7 @@ def read_tags(path: Path) -> ImageTags:
             has_alpha_channel=False, whole=True, kind="raw",
         )  # fmt: skip
     with open_image(path) as image:
-        kind, exif = _kind(image), image.getexif()  # of a PNG, the latter forgets how its pixels lie
+        kind, exif = _kind(image), exif_of(image)  # of a PNG, the latter forgets how its pixels lie
         width, height = stored_size(image)
         return ImageTags(
             width=width,
@@ -65,7 +66,7 @@ def read_tags(path: Path) -> ImageTags:
             tags=dict(exif),
             details=dict(exif.get_ifd(_EXIF_IFD)),
             gps=dict(exif.get_ifd(_GPS_IFD)),
-            xmp_packet=_xmp_packet(image),
+            xmp_packet=xmp_of(image),
             has_alpha_channel="A" in image.getbands() or "transparency" in image.info,
             whole=image.format not in JPEGS or has_end(path, image),
             kind=kind,
@@ -99,11 +100,3 @@ def _has_16_bits(image: Image.Image) -> bool:
     if image.format == "TIFF":
         return 16 in image.tag_v2.get(_BITS_PER_SAMPLE, ())  # type: ignore[attr-defined]
     return image.format == "PNG" and any("16" in str(tile[3]) for tile in getattr(image, "tile", ()))
-
-
-def _xmp_packet(image: Image.Image) -> bytes:
-    for marker, content in getattr(image, "applist", ()):
-        if marker == "APP1" and content.startswith(_XMP_HEADER):
-            return bytes(content[len(_XMP_HEADER) :])
-    packet = image.info.get("xmp", b"")
-    return packet if isinstance(packet, bytes) else str(packet).encode("utf-8", errors="replace")
