@@ -92,7 +92,9 @@ def test_exif_in_the_text_of_a_png_is_read(tmp_path):
     assert (found.tags[0x010F], float(found.details[0x920A]), found.gps[1]) == ("Maker", 8.5, "S")
 
 
-@pytest.mark.parametrize("written", ["", "\nAPP1\n 12\nzz", "\nAPP1\n 12\n123", "APP1", "\nAPP1\n-5\n00", "\nAPP1\n 9\n457869660000414243"])
+@pytest.mark.parametrize(
+    "written", ["", "\nAPP1\n 12\nzz", "\nAPP1\n 12\n123", "APP1", "\nAPP1\n-5\n00", "\nAPP1\n 9\n457869660000414243"]
+)
 def test_damaged_profiles_say_nothing(tmp_path, written):
     text = PngInfo()
     text.add_text("Raw profile type APP1", written)

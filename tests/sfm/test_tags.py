@@ -189,6 +189,16 @@ def test_altitudes_in_feet_or_over_the_take_off_give_way_to_xmp(in_exif, altitud
     assert said in datum
 
 
+@pytest.mark.parametrize(("in_exif", "words"), [(500.4, "RtkAlt as recorded"), (525.0, "EXIF GPSAltitude as recorded")])
+def test_the_reference_that_xmp_names_is_that_of_its_own_altitude(in_exif, words):
+    """Programs that correct positions afterwards write EXIF alone, above the ellipsoid perhaps."""
+    xmp = packet('drone-dji:AbsoluteAltitude="+500.0" drone-dji:AltitudeType="RtkAlt"')
+    altitude, reference = read_altitude({5: b"\x00", 6: in_exif}, xmp)
+    assert altitude == in_exif
+    assert reference.startswith(words)
+    assert ("differs from AbsoluteAltitude in XMP (RtkAlt)" in reference) is (in_exif == 525)
+
+
 def test_an_altitude_gives_way_to_no_default_and_not_where_another_source_confirms_it():
     heights = 'drone-dji:RelativeAltitude="+50.1" drone-dji:AbsoluteAltitude='
     for xmp in ('"+0.00"', '"+90.00" drone-dji:AltitudeWGS84="50.0"'):  # a take-off at the sea
