@@ -29,8 +29,8 @@ MIN_HEADING_SPREAD = 0.3
 SCATTER_DEG, CONTRADICT_DEG, CONTRADICT_SIGMAS = 20.0, 45.0, 3.0
 #: What errors about up and about mirror images ask where it is from attitudes, and is down by the views.
 LOOKED_UP = (
-    " Or are the recorded attitudes wrong, by which the cameras looked up (a gimbal's pitch of +90° where straight down "
-    "is -90°)? Then mend or remove them."
+    " Or are the recorded attitudes wrong, by which the cameras looked up (a pitch of +90° where straight down "
+    "is -90°)?"
 )
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
