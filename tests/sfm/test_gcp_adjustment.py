@@ -24,6 +24,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.sfm import incremental_mapper
+from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left
 from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
@@ -434,6 +435,26 @@ def test_a_focal_length_that_altitudes_leave_open_is_fitted_where_the_model_show
     after = [camera.params for camera in model.cameras.values()]
     assert np.array_equal(before, after) is held
     assert incremental_mapper.release_focal([model], (False, "asked for"), 1) == (False, "asked for")
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.6, 1.5])
+def test_a_focal_length_that_one_tag_alone_says_is_given_up_where_photographs_contradict_it(made, factor):
+    model = pycolmap.Reconstruction(made / "mapped")
+    for camera in model.cameras.values():
+        camera.focal_length *= factor
+    held = pycolmap.BundleAdjustmentOptions()
+    held.print_summary, held.refine_focal_length = False, False
+    pycolmap.bundle_adjustment(model, held)  # what a mapper makes of it
+    group = CameraGroup(
+        camera="", width=0, height=0, focal_px=model.cameras[1].focal_length, has_focal_prior=True, source="",
+        images=(), is_confirmed=False,
+    )  # fmt: skip
+    why, groups = (True, "one height"), [group]
+    assert incremental_mapper.is_contradicted(model, why, groups, 1) is (factor != 1)
+    assert model.cameras[1].focal_length == group.focal_px
+    for not_asked in ((False, "fitted"), (True, incremental_mapper.ASKED)):
+        assert not incremental_mapper.is_contradicted(model, not_asked, groups, 1)
+    assert not incremental_mapper.is_contradicted(model, why, [replace(group, is_confirmed=True)], 1)
 
 
 @pytest.mark.parametrize("flip", ["exchanged", "from the lower edge", "of half the size"])

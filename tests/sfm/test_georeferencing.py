@@ -15,6 +15,7 @@ from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
+from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm import georegistration
 from vdgs.sfm.flights import untrusted_offsets
@@ -409,6 +410,39 @@ def test_attitudes_that_plainly_contradict_the_views_are_not_used():
     up, notes = up_of_an_arc(160.0)  # looks up and back
     assert "contradict" in notes[0]
     assert up.how == "the views"
+
+
+def survey_looking_down(pitch_deg: float) -> tuple[SimpleNamespace, list[SimpleNamespace], GpsPriors]:
+    """A survey of 25 photographs, nearly straight down, with this pitch of the gimbal recorded."""
+    rng = np.random.default_rng(0)
+    turn, images, photographs = Rotation.random(random_state=3).as_matrix(), {}, []
+    places = np.array([[20.0 * (k % 5), 20.0 * (k // 5), 60 + rng.normal(0, 1)] for k in range(25)])
+    for k, place in enumerate(places):
+        pose = attitude_from_gimbal(90.0 * (k % 2), -85.0, 0.0).camera_from_enu @ turn.T
+        images[k] = SimpleNamespace(
+            name=str(k), has_pose=True, projection_center=lambda place=place: turn @ place,
+            cam_from_world=lambda pose=pose: SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: pose)),
+        )  # fmt: skip
+        recorded = attitude_from_gimbal(90.0 * (k % 2), pitch_deg, 0.0)
+        photographs.append(SimpleNamespace(name=str(k), attitude=recorded, face="", datetime="", gps_std=None))
+    points = {k: SimpleNamespace(xyz=turn @ each) for k, each in enumerate(rng.uniform(0, 80, (400, 3)) * [1, 1, 0.05])}
+    positions = GpsPriors(
+        enu=places - [40.0, 40, 60], gps_std=np.full((25, 3), 1.0), image_indices=np.arange(25),
+        origin=(-33.5, -70.6, 500.0), altitude_reference="", source="EXIF", notes=(),
+    )  # fmt: skip
+    return SimpleNamespace(images=images, points3D=points), photographs, positions
+
+
+def test_attitudes_that_look_up_are_named_where_positions_look_mirrored_by_them():
+    """A pitch of +90 degrees straight down, as some firmware writes it; and positions that are mirrored indeed."""
+    model, photographs, positions = survey_looking_down(85.0)
+    with pytest.raises(CaptureError, match=r"mirrored: .* Or are the recorded attitudes wrong.* say --georeference"):
+        georegistration.georegister(model, photographs, positions)
+    model, photographs, positions = survey_looking_down(-85.0)
+    flipped = replace(positions, enu=positions.enu * [-1, 1, 1])
+    with pytest.raises(CaptureError, match="mirrored") as said:
+        georegistration.georegister(model, photographs, flipped)
+    assert "attitudes" not in str(said.value)
 
 
 # ---------------------------------------------------------------------------------------------- control points

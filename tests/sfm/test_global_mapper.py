@@ -13,6 +13,7 @@ from rich.console import Console
 
 pycolmap = pytest.importorskip("pycolmap")
 
+from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import VdgsError  # noqa: E402
 from vdgs.geometry.similarity import fit_similarity  # noqa: E402
 from vdgs.sfm import global_mapper, incremental_mapper, reconstruct  # noqa: E402
@@ -157,6 +158,29 @@ def test_work_that_stops_while_parts_are_joined_goes_on(copied, monkeypatch):
     copied.forget("joined")
     assert not copied.is_begun("joined", "key")
     assert copied.is_done("model", "key")
+
+
+def test_a_focal_length_that_the_photographs_contradict_is_fitted_anew_and_work_goes_on_there(copied, monkeypatch):
+    """The models of the wrong one are made once, also where the work stops after them."""
+    plan = SimpleNamespace(
+        image_list=SimpleNamespace(images=[]), threads=1, gps_priors=None,
+        request=SimpleNamespace(options=SfmOptions(focal="fixed")),
+    )  # fmt: skip
+    made = []
+
+    def map_with(_plan, workspace, key, _count, fix_focal, _console):
+        workspace.begin("model", key)
+        made.append(fix_focal)
+        if made == [True, False]:
+            raise KeyboardInterrupt
+        return [None]
+
+    monkeypatch.setattr(reconstruct, "_models", map_with)
+    monkeypatch.setattr(incremental_mapper, "is_contradicted", lambda *_: True)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct._mapped(plan, copied, [], "key", 16, CONSOLE)
+    assert reconstruct._mapped(plan, copied, [], "key", 16, CONSOLE)[1] == (False, incremental_mapper.CONTRADICTED)
+    assert made == [True, False, False]
 
 
 def test_models_that_are_made_anew_are_joined_anew(copied):

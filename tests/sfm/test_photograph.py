@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, WIDTH, add_xmp, write_photograph
 from vdgs.captures.reconstruction import excluded_lines
+from vdgs.captures.xmp_packets import MAX_XMP_BYTES
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -35,7 +36,7 @@ from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
-from vdgs.sfm.xmp import MAX_PACKET_BYTES, first_number, read_xmp
+from vdgs.sfm.xmp import first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 PIX4D_PIXELS = {"Camera:PerspectiveFocalLength": "2800", "Camera:PerspectiveFocalLengthUnits": "pixel"}
@@ -154,7 +155,7 @@ def test_xmp_is_read_as_attributes_and_as_elements_and_expands_nothing():
         -2.5,
         None,
     )
-    assert read_xmp(b" " * MAX_PACKET_BYTES + b' y:Height="1"') == {}
+    assert read_xmp(b" " * MAX_XMP_BYTES + b' y:Height="1"') == {}
     assert first_number({"a:b": "nan", "a:c": "inf"}, "a:b", "a:c") is None
 
 

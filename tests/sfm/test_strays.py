@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,13 +21,16 @@ from vdgs.captures.jpeg import lacks_only_end
 from vdgs.captures.strays import walk
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
+from vdgs.sfm.cross_checks import strays
 from vdgs.sfm.feature_extraction import write_upright_images
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images, is_image_folder
 from vdgs.sfm.image_metadata import UnusableImage, read_image_metadata
 from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.mask_files import apply_orientation
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.workspace import Workspace
+from vdgs.system.lazy_pycolmap import pycolmap
 
 COUNT = 6
 
@@ -212,6 +216,28 @@ def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
     assert all(f"another version of z/{each.name[-12:]}" in each.reason for each in found.excluded)
 
 
+@pytest.mark.parametrize("counted", ["20260601_100000-1", "20260601_100000(0)", "20260601_100000_1"])
+@pytest.mark.parametrize("subseconds", [None, ("000", "500")])
+def test_photographs_of_one_second_are_no_copies_of_each_other(tmp_path, counted, subseconds):
+    """Cameras and programs that name photographs by their second count those of one; what is downloaded twice shows the
+    same."""
+    shown = [pixels(0), np.roll(pixels(0), 40, axis=1), pixels(0)]
+    for name, each, part in zip(("20260601_100000", counted, "20260601_100000 (3)"), shown, (0, 1, 0), strict=True):
+        write_photograph(tmp_path / f"{name}.jpg", each, 0, np.array([0.0, 0.0, 40.0]))
+        with Image.open(tmp_path / f"{name}.jpg") as image:
+            exif = image.getexif()
+        if subseconds:
+            exif.get_ifd(0x8769)[0x9291] = subseconds[part]
+        picture(tmp_path / f"{name}.jpg", each, exif=exif, quality=90 + part)
+    found = {photo.name: photo for photo in (read_image_metadata(file, file.name) for file in tmp_path.iterdir())}
+    reasons, _ = strays([*found.values()])
+    assert [*reasons] == ["20260601_100000 (3).jpg"]
+    if subseconds:  # those of which both say it differ, whatever they show
+        same = replace(found[f"{counted}.jpg"], path=found["20260601_100000.jpg"].path)
+        assert not strays([found["20260601_100000.jpg"], same])[0]
+        assert strays([found["20260601_100000.jpg"], replace(same, subsecond=0.0)])[0]
+
+
 def test_raw_files_in_a_folder_beside_their_pictures_are_left_out(tmp_path):
     pytest.importorskip("rawpy")
     (tmp_path / "JPG").mkdir()
@@ -362,6 +388,32 @@ def test_what_is_done_with_other_kinds_is_said(tmp_path):
     shown = decode_image(workspace.images / "R_0.DNG")[0]
     off = np.abs(shown.astype(int) - np.rot90(pixels(0), -1))
     assert off[20:-20, 20:-20].mean() < 12  # the sensor has one color of three at each pixel
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_colmap_gets_pixels_of_every_format_that_is_read(tmp_path, orientation):
+    """By the content of a file: COLMAP's decoder finds nothing in some formats, and reads others black."""
+    tags = Image.Exif()
+    tags[0x0112] = orientation
+    formats = {
+        "a.webp": {"lossless": True}, "webp.jpg": {"format": "WEBP", "lossless": True}, "gif.png": {"format": "GIF"},
+        "jpeg2000.tif": {"format": "JPEG2000"}, "zstd.tif": {"compression": "zstd"},
+        "lzma.tif": {"compression": "lzma"}, "lzw.tif": {"compression": "tiff_lzw"},
+        "jpeg.tif": {"compression": "jpeg", "quality": 98}, "named.webp": {"format": "JPEG", "quality": 98},
+        "plain.tif": {}, "b.png": {}, "c.bmp": {}, "png.jpg": {"format": "PNG"},
+    }  # fmt: skip
+    for k, (name, how) in enumerate(formats.items()):
+        picture(tmp_path / "in" / name, cv2.GaussianBlur(pixels(k), (0, 0), 4), exif=tags, **how)
+    found = collect_images([tmp_path / "in"])
+    assert {each.name for each in found.images} == formats.keys()
+    assert "WebP; converted to 8-bit sRGB and written as JPEG (a.webp.jpg)" in " ".join(found.notes)
+    assert "zstd.tif: TIFF compressed by zstd; converted" in " ".join(found.notes)
+    workspace = Workspace(tmp_path / "work")
+    assert not write_upright_images(workspace, found.images)
+    for photo in found.images:
+        seen = pycolmap.Bitmap.read(str(workspace.images / photo.name), True).to_array()
+        shown = apply_orientation(decode_image(photo.path)[0], photo.orientation)
+        assert np.abs(seen.astype(int) - shown).mean() < 2, photo.name
 
 
 # ---------------------------------------------------------------------------------------------- ends of JPEGs

@@ -189,6 +189,16 @@ def test_altitudes_in_feet_or_over_the_take_off_give_way_to_xmp(in_exif, altitud
     assert said in datum
 
 
+@pytest.mark.parametrize(("in_exif", "words"), [(500.4, "RtkAlt as recorded"), (525.0, "EXIF GPSAltitude as recorded")])
+def test_the_reference_that_xmp_names_is_that_of_its_own_altitude(in_exif, words):
+    """Programs that correct positions afterwards write EXIF alone, above the ellipsoid perhaps."""
+    xmp = packet('drone-dji:AbsoluteAltitude="+500.0" drone-dji:AltitudeType="RtkAlt"')
+    altitude, reference = read_altitude({5: b"\x00", 6: in_exif}, xmp)
+    assert altitude == in_exif
+    assert reference.startswith(words)
+    assert ("differs from AbsoluteAltitude in XMP (RtkAlt)" in reference) is (in_exif == 525)
+
+
 def test_an_altitude_gives_way_to_no_default_and_not_where_another_source_confirms_it():
     heights = 'drone-dji:RelativeAltitude="+50.1" drone-dji:AbsoluteAltitude='
     for xmp in ('"+0.00"', '"+90.00" drone-dji:AltitudeWGS84="50.0"'):  # a take-off at the sea
@@ -351,6 +361,32 @@ def test_the_makers_calibration_survives_a_rewritten_size():
     assert lens is not None
     assert lens.focal == pytest.approx(3666.6 / 5472)
     assert 1 / AGREE < lens.focal / 0.667 < AGREE
+
+
+ADOBE = "Adobe Photoshop Lightroom 6.0 (Windows)"
+
+
+@pytest.mark.parametrize(
+    ("model", "program", "changes", "size", "focal", "said"),
+    [
+        pytest.param("Wing", "v1.02", {}, (400, 300), 0.85, "", id="a camera's own firmware"),
+        pytest.param("Wing", ADOBE, {}, (400, 300), 0.85, f"{ADOBE} wrote it", id="a program"),
+        pytest.param("Wing", ADOBE, {}, (200, 150), 0.85, "", id="a program that left the size"),
+        pytest.param("Wing", ADOBE, {0xA405: 30}, (400, 300), 0.85, "", id="confirmed by the equivalent"),
+        pytest.param("Canon EOS 6D", ADOBE, {0x920A: 30.6, 0xA003: 267, 0xA20E: 900 / 36}, (400, 267), 0.85,
+                     "765 px by EXIF's focal length and sensor, but 340 px by EXIF's focal length, the sensor of",
+                     id="shrunk, a sensor of 36 mm"),
+    ],
+)  # fmt: skip
+def test_what_programs_may_have_rewritten_is_named_and_gives_way_to_the_sensor_of_the_model(
+    model, program, changes, size, focal, said
+):
+    lens = read_lens({0x0110: model, 0x0131: program}, DETAILS | changes, {}, *size)
+    assert lens is not None
+    assert lens.focal == pytest.approx(focal, abs=2e-3)
+    assert said in lens.doubt + lens.remark
+    assert said or not lens.doubt + lens.remark
+    assert lens.confirmed is (0xA405 in changes)
 
 
 @pytest.mark.parametrize("in_focal_length", [False, True])

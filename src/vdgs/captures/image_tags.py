@@ -13,10 +13,15 @@ from vdgs.captures.image_files import mode_of, open_image
 from vdgs.captures.jpeg import JPEGS, has_end
 from vdgs.captures.raw_files import is_raw, raw_size, raw_tags
 from vdgs.captures.tiff_orientation import stored_size
+from vdgs.captures.xmp_packets import exif_of, xmp_of
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
 _BITS_PER_SAMPLE = 0x0102
+#: Pillow's formats that all programs read, COLMAP's decoder among them, and the compressions of TIFF that every build
+#: of libtiff has. Of others COLMAP finds nothing, or reads black.
+_COMMON_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")
+_COMMON_COMPRESSIONS = ("raw", "packbits", "tiff_lzw", "tiff_deflate", "tiff_adobe_deflate", "jpeg")
+_NAMES = {"HEIF": "HEIC", "WEBP": "WebP"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,12 +37,13 @@ class ImageTags:
     details: dict[int, Any]
     gps: dict[int, Any]
     xmp_packet: bytes
+    """All packets, one behind the other."""
     has_alpha_channel: bool
     whole: bool
     """False for a JPEG without an end marker."""
     kind: str
-    """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, raw, CMYK, Display P3, 16 bits a
-    channel; empty for what is."""
+    """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, WebP, raw, CMYK, Display P3, 16 bits
+    a channel; empty for what is."""
 
 
 def read_tags(path: Path) -> ImageTags:
@@ -51,7 +57,7 @@ def read_tags(path: Path) -> ImageTags:
             has_alpha_channel=False, whole=True, kind="raw",
         )  # fmt: skip
     with open_image(path) as image:
-        kind, exif = _kind(image), image.getexif()  # of a PNG, the latter forgets how its pixels lie
+        kind, exif = _kind(image), exif_of(image)  # of a PNG, the latter forgets how its pixels lie
         width, height = stored_size(image)
         return ImageTags(
             width=width,
@@ -60,7 +66,7 @@ def read_tags(path: Path) -> ImageTags:
             tags=dict(exif),
             details=dict(exif.get_ifd(_EXIF_IFD)),
             gps=dict(exif.get_ifd(_GPS_IFD)),
-            xmp_packet=_xmp_packet(image),
+            xmp_packet=xmp_of(image),
             has_alpha_channel="A" in image.getbands() or "transparency" in image.info,
             whole=image.format not in JPEGS or has_end(path, image),
             kind=kind,
@@ -76,21 +82,21 @@ def kind_of(path: Path) -> str:
 
 
 def _kind(image: Image.Image) -> str:
-    parts = [image.format] if image.format in ("HEIF", "AVIF") else []
     space = foreign_space(image)
-    parts += [space] if space else ["16 bits a channel"] if _has_16_bits(image) else []
-    return ", ".join(parts).replace("HEIF", "HEIC")
+    colors = space or ("16 bits a channel" if _has_16_bits(image) else "")
+    return ", ".join(filter(None, (_uncommon_format(image), colors)))
+
+
+def _uncommon_format(image: Image.Image) -> str:
+    """The format by its content, whatever its name ends in, where not all programs read it."""
+    found = image.format or ""
+    if found not in _COMMON_FORMATS:
+        return _NAMES.get(found, found)
+    compression = str(image.info.get("compression", "raw")) if found == "TIFF" else "raw"
+    return "" if compression in _COMMON_COMPRESSIONS else f"TIFF compressed by {compression.removeprefix('tiff_')}"
 
 
 def _has_16_bits(image: Image.Image) -> bool:
     if image.format == "TIFF":
         return 16 in image.tag_v2.get(_BITS_PER_SAMPLE, ())  # type: ignore[attr-defined]
     return image.format == "PNG" and any("16" in str(tile[3]) for tile in getattr(image, "tile", ()))
-
-
-def _xmp_packet(image: Image.Image) -> bytes:
-    for marker, content in getattr(image, "applist", ()):
-        if marker == "APP1" and content.startswith(_XMP_HEADER):
-            return bytes(content[len(_XMP_HEADER) :])
-    packet = image.info.get("xmp", b"")
-    return packet if isinstance(packet, bytes) else str(packet).encode("utf-8", errors="replace")

@@ -51,6 +51,8 @@ class Up:
     how: str
     sure: bool = True
     """Whether up may be taken for down by mistake: no."""
+    doubt: str = ""
+    """What else says that it is down, for errors: a sentence behind a blank, or empty."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

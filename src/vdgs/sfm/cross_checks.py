@@ -35,15 +35,19 @@ BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
 _DJI_NAME = re.compile(
     r"(?:(?P<before>.*?)(?P<time>\d{14})|)(?P<number>.*?)_(?P<camera>[TSVWZ])(?P<after>_.*)?", re.IGNORECASE
 )
-#: How systems and programs name what they copy, edit or download again.
+#: How systems and programs name what they copy or edit.
 _COPY_NAME = re.compile(
-    r"(.+?)(?:[ _]?\(\d{1,2}\)|[ _-]+(?:copy|copie|kopie|copia)(?:[ _]?\(?\d{1,2}\)?)?"
-    r"|[-_~](?:edited|edit|bearbeitet|hdr|enhanced(?:-(?:nr|sr|rd)){0,3}|\d))",
+    r"(.+?)(?:[ _-]+(?:copy|copie|kopie|copia)(?:[ _]?\(?\d{1,2}\)?)?"
+    r"|[-_~](?:edited|edit|bearbeitet|hdr|enhanced(?:-(?:nr|sr|rd)){0,3}))",
     re.IGNORECASE,
 )
+#: How they count what they download again, and how cameras count photographs of one second.
+_COUNTED_NAME = re.compile(r"(.+?)(?:[ _]?\(\d{1,2}\)|[-_~]\d)")
 #: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
 _EDITED_ON_PHONE = re.compile(r"(.*\bIMG_)E(\d{4})", re.IGNORECASE)
 _SAME_MOMENT = timedelta(seconds=2)
+#: Programs may cut off the digits of parts of a second behind the second one.
+_SAME_SUBSECOND = 0.01
 #: Programs that convert photographs may round places by so much (about a metre; choice).
 _ROUNDED_DEG = 1e-5
 #: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
@@ -262,7 +266,15 @@ def _other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 def taken_apart(photo: ImageMetadata, other: ImageMetadata) -> bool:
     """Whether two photographs were taken at other moments or places, as far as both say it."""
     moments = photo.datetime, other.datetime
-    return (all(moments) and moments[0] != moments[1]) or _are_of_other_places(photo, other)
+    apart = all(moments) and (moments[0] != moments[1] or _are_of_other_parts(photo, other))
+    return apart or _are_of_other_places(photo, other)
+
+
+def _are_of_other_parts(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether both say the part of their second, and these differ."""
+    if photo.subsecond is None or other.subsecond is None:
+        return False
+    return abs(photo.subsecond - other.subsecond) >= _SAME_SUBSECOND
 
 
 def _are_of_other_places(photo: ImageMetadata, other: ImageMetadata) -> bool:
@@ -303,17 +315,21 @@ def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 
 
 def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
-    """Photographs that were downloaded twice or edited, beside the first: of its moment and place, named after it."""
+    """Photographs that were edited or downloaded twice, beside the first: of its moment and place, named after it. A
+    name that merely counts may be that of the next photograph of the same second: there both must show the same."""
     names = {PurePosixPath(photo.name).with_suffix("").as_posix().lower(): photo for photo in photographs}
     found = {}
     for photo in photographs:
         stem = PurePosixPath(photo.name).with_suffix("").as_posix()
-        match = _COPY_NAME.fullmatch(stem) or _EDITED_ON_PHONE.fullmatch(stem)
+        edited = _COPY_NAME.fullmatch(stem) or _EDITED_ON_PHONE.fullmatch(stem)
+        match = edited or _COUNTED_NAME.fullmatch(stem)
         first = names.get("".join(match.groups()).lower()) if match else None
         if first is None or not photo.datetime or photo.camera != first.camera:
             continue
-        if (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon):
-            found[photo.name] = f"is a copy or another version of {first.name}, by its name, moment and place"
+        same = (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon) and not taken_apart(photo, first)
+        if same and (edited or _show_the_same([(first, photo)])):
+            shown = "" if edited else ", and what it shows"
+            found[photo.name] = f"is a copy or another version of {first.name}, by its name, moment and place{shown}"
     return found
 
 

@@ -16,8 +16,9 @@ SAME_PLACE_DEG = 1e-3
 LOWEST_M = -450
 #: Altitudes beyond this (metres) are damage.
 HIGHEST_M = 20_000.0
-#: Altitudes in EXIF and XMP that are farther apart (metres) are not of one reference (choice).
-MOST_APART_M = 30.0
+#: Altitudes in EXIF and XMP that differ by this much (metres) are two, not one that was rounded; those that are farther
+#: apart than the second are not of one reference (choice).
+OTHER_M, MOST_APART_M = 1.0, 30.0
 #: Heights that differ by less (metres) are one number, written twice: near the sea, altitudes are nearly heights.
 SAME_HEIGHT_M = 0.2
 #: EXIF's tags: latitude and longitude, each behind its reference.
@@ -138,10 +139,10 @@ def read_altitudes(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Alti
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
     confirmed = bool(ellipsoidal and abs(ellipsoidal - value) < SAME_M)
     by_xmp = not confirmed and _is_absolute_otherwise(value, absolute, xmp)
-    named = "AbsoluteAltitude in XMP" if abs(abs(value) - abs(absolute)) >= 1 else ""
-    both = _measured(value, absolute, xmp, ""), _measured(absolute, absolute, xmp, named)
+    own = "AbsoluteAltitude in XMP" if abs(abs(value) - abs(absolute)) >= OTHER_M else ""
+    both = _measured(value, absolute, xmp, ""), _measured(absolute, absolute, xmp, own)
     taken = both[by_xmp] if both[by_xmp][0] is not None else both[not by_xmp]
-    return taken, both if abs(value - absolute) >= 1 else None
+    return taken, both if abs(value - absolute) >= OTHER_M else None
 
 
 def _measured(value: float | None, absolute: float | None, xmp: Mapping[str, str], source: str) -> Altitude:
@@ -153,8 +154,10 @@ def _measured(value: float | None, absolute: float | None, xmp: Mapping[str, str
     ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, "AltitudeType", "Camera:VertCS")
     if ellipsoidal is not None and abs(ellipsoidal - value) < SAME_M:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
-    if absolute and abs(value - absolute) > MOST_APART_M:
-        return value, "EXIF GPSAltitude as recorded, which differs from AbsoluteAltitude in XMP by more than 30 m"
+    if absolute and abs(value - absolute) >= OTHER_M:  # what XMP names is its own
+        more = f" by more than {MOST_APART_M:.0f} m" if abs(value - absolute) > MOST_APART_M else ""
+        kind = f" ({named})" if named else ""
+        return value, f"EXIF GPSAltitude as recorded, which differs from AbsoluteAltitude in XMP{kind}{more}"
     if named and source:
         named = f"{source} ({named})"
     return value, f"{named} as recorded" if named else f"{source or 'EXIF GPSAltitude'} as recorded, datum not stated"

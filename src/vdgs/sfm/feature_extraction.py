@@ -56,6 +56,8 @@ class CameraGroup:
     images: tuple[ImageMetadata, ...]
     model: str = RADIAL
     """COLMAP's model of the lens."""
+    is_confirmed: bool = True
+    """False where one tag alone says the focal length."""
 
 
 def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
@@ -82,6 +84,7 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
                 source=source,
                 images=tuple(members),
                 model=first.camera_model,
+                is_confirmed=lens is None or lens.confirmed,
             )
         )
     return kinds

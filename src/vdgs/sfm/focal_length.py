@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from vdgs.sfm.exif_gps import plain_text
 from vdgs.sfm.xmp import first_number, text
 
-#: Sensors in millimetres across and down, of cameras that do not say it in EXIF, by EXIF's model.
+#: Sensors in millimetres across and down, of cameras that do not say it in EXIF, or say nothing else, by EXIF's model.
 _SMALL, _ONE_INCH, _FOUR_THIRDS = (6.17, 4.55), (13.2, 8.8), (17.3, 13.0)
+_POWERSHOT, _CANON_APS, _FULL_FRAME = (7.44, 5.58), (22.3, 14.9), (36.0, 24.0)
+_EOS = "CANON EOS "
 SENSOR_MM = {
     **dict.fromkeys(("FC300S", "FC300X", "FC300C", "FC330", "FC220", "FC350", "FC2103"), _SMALL),
     **dict.fromkeys(("FC6310", "FC6310S", "FC6310R", "L1D-20C", "FC3411"), _ONE_INCH),
     "FC550": _FOUR_THIRDS,
+    **dict.fromkeys(("CANON POWERSHOT S100", "CANON POWERSHOT S110"), _POWERSHOT),
+    **dict.fromkeys((f"{_EOS}M", f"{_EOS}100D", f"{_EOS}REBEL SL1", f"{_EOS}7D", f"{_EOS}7D MARK II"), _CANON_APS),
+    **dict.fromkeys((f"{_EOS}5D{mark}" for mark in ("", *(f" MARK {n}" for n in ("II", "III", "IV")))), _FULL_FRAME),
+    **dict.fromkeys((f"{_EOS}{model}" for model in ("5DS", "5DS R", "6D", "6D MARK II", "RP", "R")), _FULL_FRAME),
 }
 #: Half the diagonal's meaning of "35 mm equivalent": that of a 36 x 24 mm picture.
 DIAGONAL_35_MM = math.hypot(36, 24)
@@ -38,6 +46,12 @@ CUT = 0.02
 USUAL_SHAPES = (16 / 9, 3 / 2, 4 / 3, 1.0)
 #: Programs that shrink photographs leave less of them than this share of the longer side (choice).
 MAX_SHRUNK = 0.6
+#: Programs that write photographs anew, by what they call themselves.
+_EDITORS = re.compile(
+    r"adobe|photoshop|lightroom|gimp|darktable|rawtherapee|capture one|affinity|magick|dxo|picasa|xnview|irfanview"
+    r"|acdsee|luminar|snapseed|faststone|photoscape",
+    re.IGNORECASE,
+)
 #: A digital zoom beyond this is damage.
 LARGEST_ZOOM = 100.0
 
@@ -60,6 +74,8 @@ class Lens:
     """Whether the 35 mm equivalent has the zoom in it, where EXIF's FocalLength has not."""
     remark: str = ""
     """What is assumed of it, where that is likely enough to hold it."""
+    confirmed: bool = False
+    """Whether two ways say it that do not depend on each other."""
 
 
 def read_lens(
@@ -88,11 +104,13 @@ def read_lens(
     if not known:
         return None
     focal, source, doubt = _agreed(known, longer, copied=equivalent_mm == focal_mm)
-    confirmed = as_written is not None and _alike(as_written, focal) and not _alike(as_written, focal / zoom)
+    agreeing = {_witness(how) for other, how in known if alike(focal, other)}
+    remark = unclear if cut else "" if len(agreeing) > 1 else _rewritten(tags, xmp, source, original, longer)
+    zoom_confirmed = as_written is not None and alike(as_written, focal) and not alike(as_written, focal / zoom)
     if unclear and not cut:
         doubt = "; ".join(filter(None, (unclear, doubt)))
     counted = 1.0 if source == EQUIVALENT else zoom
-    return Lens(focal, source, doubt, counted, zoom, focal_mm, confirmed, remark=unclear if cut else "")
+    return Lens(focal, source, doubt, counted, zoom, focal_mm, zoom_confirmed, remark, confirmed=len(agreeing) > 1)
 
 
 def unzoomed(lens: Lens) -> Lens:
@@ -112,14 +130,14 @@ def _agreed(known: list[tuple[float, str]], longer: int, copied: bool) -> tuple[
     shrinks a photograph may rewrite. Of witnesses that contradict each other the 35 mm equivalent is the likelier:
     it stays right then; but not where it merely repeats the focal length. After it comes the table of sensors.
     """
-    support = [len({_witness(how) for other, how in known if _alike(one, other)}) for one, _ in known]
+    support = [len({_witness(how) for other, how in known if alike(one, other)}) for one, _ in known]
     most = [k for k, count in enumerate(support) if count == max(support)]
     chosen = most[0]
     if max(support) == 1:
         trust = {EQUIVALENT: 0 if not copied else 4, CALIBRATED_SOURCE: 2, SENSOR: 3}
         chosen = min(most, key=lambda k: trust.get(known[k][1], 1))
     focal, source = known[chosen]
-    others = [f"{other * longer:.0f} px by {how}" for other, how in known if not _alike(other, focal)]
+    others = [f"{other * longer:.0f} px by {how}" for other, how in known if not alike(other, focal)]
     if not others:
         return focal, source, ""
     return (
@@ -136,7 +154,21 @@ def _witness(source: str) -> str:
     return SENSOR if source in (CALIBRATED_SOURCE, PIX4D_SOURCE) else source
 
 
-def _alike(one: float, other: float) -> bool:
+def _rewritten(tags: Mapping[int, Any], xmp: Mapping[str, str], source: str, original: float, longer: float) -> str:
+    """What speaks against a focal length that counts pixels of the original and that nothing confirms: a program wrote
+    the photograph, and EXIF's size is that of the file."""
+    programs = plain_text(tags.get(0x0131)), text(xmp, "xmp:CreatorTool")
+    program = next((each for each in programs if _EDITORS.search(each)), "")
+    if not program or _witness(source) != SENSOR or original > longer:
+        return ""
+    return (
+        f"{source} alone says its focal length, and {program} wrote it: if that shrank it and rewrote its size, the "
+        "focal length is too long; not held where the photographs plainly contradict it"
+    )
+
+
+def alike(one: float, other: float) -> bool:
+    """Whether two focal lengths may be one, as far as tags say it."""
     return 1 / AGREE < one / other < AGREE
 
 

@@ -246,6 +246,7 @@ class Doubts:
             return (
                 f"placed by it the world would be turned by {tilted:.0f}° from what the photographs say of up"
                 f"{', its own mirror image' if exchanged or tilted > 90 else ''}. Are x (east) and y (north) exchanged?"
+                f"{self.up.doubt}"
             )
         return ""
 
@@ -323,5 +324,5 @@ def _refuse_upside_down(
             f"placed by {placed.method}, the cameras would be {abs(height):.3g} m "
             f"{'under' if height < 0 else 'over'} the "
             f"ground and look up, against what the photographs show. Are east and north (x and y, latitude and "
-            f"longitude) exchanged, or is a hemisphere missing? {georegistration.ANYWAY}"
+            f"longitude) exchanged, or is a hemisphere missing?{up.doubt} {georegistration.ANYWAY}"
         )

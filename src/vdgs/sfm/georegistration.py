@@ -27,6 +27,11 @@ MIN_HEADING_SPREAD = 0.3
 #: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, and by so
 #: many standard deviations of it, are no measurements (choice).
 SCATTER_DEG, CONTRADICT_DEG, CONTRADICT_SIGMAS = 20.0, 45.0, 3.0
+#: What errors about up and about mirror images ask where it is from attitudes, and is down by the views.
+LOOKED_UP = (
+    " Or are the recorded attitudes wrong, by which the cameras looked up (a pitch of +90° where straight down "
+    "is -90°)?"
+)
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
 #: Recorded headings count from so many on that agree so well (mean of unit vectors); the other way round is so far.
@@ -111,7 +116,7 @@ def georegister(
         raise CaptureError(
             f"the positions ({positions.source}) fit the photographs only once {wrong}: as they are, the world would "
             "be its own mirror image, or upside down. Are latitude and longitude exchanged, or is a hemisphere (S, W, "
-            f"a minus sign) missing? {ANYWAY}"
+            f"a minus sign) missing?{up.doubt} {ANYWAY}"
         )
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
@@ -353,7 +358,8 @@ def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
         return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
     found = level.T @ np.append(-tilt, 1.0)
     deviation = float(np.hypot(scatter / np.sqrt(len(seen)), HANGS_DEG if several else HANGS_ALIKE_DEG))
-    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes"), []
+    doubt = LOOKED_UP if apart > 90 else ""
+    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes", doubt=doubt), []
 
 
 def registration_in_place(

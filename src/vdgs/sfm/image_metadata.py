@@ -199,6 +199,8 @@ class ImageMetadata:
     """How far the place may be off by the datum that EXIF names."""
     fix: str = ""
     """What EXIF says against its position or altitude: `VOID`, `FLAT`; empty for nothing."""
+    subsecond: float | None = None
+    """The part of the second of `datetime`, where EXIF says it (SubSecTimeOriginal)."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 
@@ -277,6 +279,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         camera=_camera(tags, details, xmp),
         lens=lens,
         datetime=plain_text(details.get(0x9003)) or plain_text(tags.get(0x0132)),
+        subsecond=_subsecond(details),
         lat_lon=place,
         altitude=altitude,
         altitude_type=altitude_type,
@@ -359,6 +362,12 @@ def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[st
     serial = plain_text(details.get(0xA431)) or text(xmp, "CameraSerialNumber")
     named = model if maker and model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
     return f"{named or UNKNOWN_CAMERA}{f' no. {serial}' if serial else ''}"
+
+
+def _subsecond(details: Mapping[int, Any]) -> float | None:
+    """EXIF's SubSecTimeOriginal: the digits behind the seconds of DateTimeOriginal; without that, those of DateTime."""
+    digits = plain_text(details.get(0x9291 if plain_text(details.get(0x9003)) else 0x9290))
+    return float(f"0.{digits}") if digits.isascii() and digits.isdigit() else None
 
 
 def _stated_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:

@@ -17,7 +17,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
-from vdgs.sfm.focal_length import CALIBRATED_SOURCE
+from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
 from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, FISHEYE, ImageMetadata
@@ -29,6 +29,12 @@ from vdgs.system.lazy_pycolmap import pycolmap
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
 #: Why a focal length is held until the model shows whether it can be fitted: `release_focal`.
 OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
+#: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`.
+ASKED = "asked for"
+CONTRADICTED = "held at what one tag alone says of it, the photographs fit together plainly worse"
+#: A fitted focal length contradicts the held one where points lie nearer to where they are seen by this share (choice),
+#: and the two are no one value as tags go (`AGREE`). Over ground that does not tell it neither is so.
+CLEARLY_NEARER = 0.05
 #: Between these quantiles (5 % and 95 %) lie so many standard deviations of errors.
 ERRORS_RANGE = 3.29
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
@@ -52,7 +58,7 @@ def should_fix_focal(
     longer lens and a lower flight look the same. Where nothing says that the flight was one like this it is fitted: a
     wrong focal length that is held bends or tears all other scenes."""
     if options.focal != "auto":
-        return options.focal == "fixed", "asked for"
+        return options.focal == "fixed", ASKED
     photographs = [photo for photo in photographs if not photo.face]
     if not photographs:
         return True, "views that are cut out of panoramas have none to fit"
@@ -103,12 +109,34 @@ def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str],
     oblique = np.mean(views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG)))
     if _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE:
         return True, "level strips, as the photographs themselves show, whatever their altitudes say"
+    _fit_focal(model, threads)
+    return False, "several heights or views, as the photographs themselves show, which tell it"
+
+
+def is_contradicted(
+    model: pycolmap.Reconstruction, held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
+) -> bool:
+    """Whether the focal length of a model was held at what one tag alone says, and the photographs plainly say another:
+    programs that shrink photographs rewrite what tags count from."""
+    said = {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
+    if not held[0] or held[1] == ASKED or not said:
+        return False
+    as_held, fitted = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    as_held.update_point_3d_errors()
+    _fit_focal(fitted, threads)
+    nearer = 1 - fitted.compute_mean_reprojection_error() / as_held.compute_mean_reprojection_error()
+    return nearer >= CLEARLY_NEARER and any(
+        not alike(fitted.cameras[k].mean_focal_length(), focal) for k, focal in said.items() if k in fitted.cameras
+    )
+
+
+def _fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
+    """Fit the focal lengths of a model, with all else that is fitted."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary, options.ceres.solver_options.num_threads = False, threads
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     call_cancellable(lambda cancellation_token: pycolmap.bundle_adjustment(model, options))
     model.update_point_3d_errors()
-    return False, "several heights or views, as the photographs themselves show, which tell it"
 
 
 def height_over_points(image: pycolmap.Image, model: pycolmap.Reconstruction) -> float:

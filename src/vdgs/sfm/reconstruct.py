@@ -217,16 +217,13 @@ def _steps(
     plan: ReconstructionPlan, workspace: Workspace, keys: dict[str, str], console: Console
 ) -> ReconstructionReport:
     began = time.monotonic()
-    request = plan.request
     photographs = plan.image_list.images
     kinds = feature_extraction.group_by_camera(photographs)
     lost = _features(plan, workspace, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
     apply_rigs(workspace, photographs)
     pairs = _matches(plan, workspace, keys["matches"], console)
-    held = incremental_mapper.should_fix_focal(photographs, plan.gps_priors, request.options)
-    models = _models(plan, workspace, keys["model"], len(usable), held[0], console)
-    held = incremental_mapper.release_focal(models, held, plan.threads)
+    models, held = _mapped(plan, workspace, kinds, keys["model"], len(usable), console)
     left_out = exclusion_reasons(
         models[0],
         models[1:],
@@ -307,6 +304,29 @@ def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: 
     feature_matching.match_pairs(workspace, chosen, plan.threads, console)
     workspace.finish("matches", key)
     return len(chosen)
+
+
+def _mapped(
+    plan: ReconstructionPlan,
+    workspace: Workspace,
+    kinds: Sequence[feature_extraction.CameraGroup],
+    key: str,
+    count: int,
+    console: Console,
+) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
+    """The models, and whether the focal length was held and why; anew where the first show that it must not be."""
+    held = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)
+    anew = f"{key}, focal length fitted"
+    if not workspace.is_begun("model", anew):
+        models = _models(plan, workspace, key, count, held[0], console)
+        held = incremental_mapper.release_focal(models, held, plan.threads)
+        if not incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
+            return models, held
+        console.print(
+            "[yellow]note[/] the photographs contradict the focal length that is held; it is fitted, all anew",
+            highlight=False,
+        )
+    return _models(plan, workspace, anew, count, False, console), (False, incremental_mapper.CONTRADICTED)
 
 
 def _models(

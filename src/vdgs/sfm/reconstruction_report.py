@@ -20,7 +20,7 @@ from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_po
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.incremental_mapper import refined_cameras
+from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -68,7 +68,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, collection.images) if metric else None
-    warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned, tilt)]
+    warnings = [*look.warnings, *_warnings(cameras, held, height, look.height_m, turned, tilt)]
     if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions with altitudes
         up = placed.residuals[:, 2]
         names = [collection.images[int(positions.image_indices[row])].name for row in placed.position_rows]
@@ -208,7 +208,7 @@ def _photographs(
 
 def _warnings(
     cameras: Sequence[CameraReport],
-    held: bool,
+    held: tuple[bool, str],
     height: float | None,
     recorded: float | None,
     turned: float | None,
@@ -217,10 +217,15 @@ def _warnings(
     found = []
     for camera in cameras:
         drift = camera.focal_after_px / camera.focal_before_px - 1
-        if not held and camera.focal_source != "a guess" and abs(drift) > MAX_FOCAL_DRIFT:
+        if not held[0] and camera.focal_source != "a guess" and abs(drift) > MAX_FOCAL_DRIFT:
+            remedy = "; if heights look wrong, hold it: --focal fixed"
+            if held[1] == CONTRADICTED:
+                remedy = (
+                    ", which the photographs contradict. Did a program shrink them and rewrite their size "
+                    "(PixelXDimension)? Mend EXIF, or hold what it says: --focal fixed"
+                )
             found.append(
-                f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if "
-                "heights look wrong, hold it: --focal fixed"
+                f"{camera.name}: the fitted focal length is {drift:+.0%} off what {camera.focal_source} says{remedy}"
             )
     sees_ground = tilt is not None and tilt < LEVEL_TILT_DEG
     if sees_ground and height is not None and recorded and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 
-#: So much of a packet is looked at; those of drones take a few kB.
-MAX_PACKET_BYTES = 1 << 18
+from vdgs.captures.xmp_packets import as_utf8
+
 #: Values that a packet may have; more are not looked at.
 MAX_VALUES = 2000
 _NAME = r"[A-Za-z_][\w.-]{0,63}"
@@ -30,7 +30,7 @@ _ITEM = re.compile(r"<rdf:li>([^<]{0,100})<")
 
 def read_xmp(packet: bytes) -> dict[str, str]:
     """Attributes and elements without children by `prefix:Name`, prefixes as they are in the file; {} for nonsense."""
-    text = packet[:MAX_PACKET_BYTES].decode("utf-8", errors="replace")
+    text = as_utf8(packet).decode("utf-8", errors="replace")
     found: dict[str, str] = {}
     for prefix, name, value in _values(text):
         if prefix != "xmlns" and len(found) < MAX_VALUES:
