@@ -64,6 +64,10 @@ def test_pseudo_views_look_at_a_place_of_the_photograph_from_nearer_and_more_til
     assert np.ptp(tilts) > 15
     nothing = plane(camera)[0]._replace(alpha=torch.zeros(camera.height, camera.width))
     assert pseudo_camera(camera, nothing, np.random.default_rng(0)) is None
+    part = camera.cropped(3, 2, 15, 12)
+    found = pseudo_camera(part, plane(part)[0], np.random.default_rng(0))
+    assert found is not None
+    assert (found.width, found.height, found.uncropped_size) == (round(12 * SIZE), round(10 * SIZE), None)
 
 
 def test_a_photograph_lends_its_colors_where_both_show_the_same_place() -> None:

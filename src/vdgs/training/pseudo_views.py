@@ -66,10 +66,9 @@ def pseudo_camera(camera: Camera, raster: Raster, rng: np.random.Generator) -> C
     tilt = math.radians(min(tilt + rng.uniform(0, MORE_TILT), max(tilt, MAX_TILT)))
     away = np.array([math.cos(heading) * math.sin(tilt), math.sin(heading) * math.sin(tilt), math.cos(tilt)])
     pose = _looking_at(middle + distance * rng.uniform(*NEARER) * away, middle, heading)
-    smaller = camera.resized(*(max(1, round(SIZE * side)) for side in (camera.width, camera.height)))
-    return replace(
-        smaller, camera_from_world=pose, cx=smaller.width / 2, cy=smaller.height / 2, uncropped_size=None
-    )  # fmt: skip
+    whole = replace(camera, uncropped_size=None)  # a part of a picture is the whole of another
+    smaller = whole.resized(*(max(1, round(SIZE * side)) for side in (camera.width, camera.height)))
+    return replace(smaller, camera_from_world=pose, cx=smaller.width / 2, cy=smaller.height / 2)
 
 
 def _looking_at(position: np.ndarray, middle: np.ndarray, heading: float) -> np.ndarray:
