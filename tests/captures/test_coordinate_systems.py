@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vdgs.captures.coordinate_systems import datum_error, names_a_system, to_geodetic
+from vdgs.captures.coordinate_systems import datum_error, geocentric_to_geodetic, names_a_system, to_geodetic
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 
@@ -161,6 +161,24 @@ def test_longitude_stays_longitude_however_a_system_is_written(tmp_path, axes, h
     change, _ = to_geodetic(wkt, tmp_path)
     assert change(np.array([[-70.6, -33.5, 500]]))[0, :2] == pytest.approx((-33.5, -70.6))
     assert datum_error(wkt, np.array([[-33.5, -70.6, 500]])) == (0.0, "")
+
+
+@pytest.mark.parametrize("datum", ["My datum", "Deutsches_Hauptdreiecksnetz"])
+@pytest.mark.parametrize("values", ["598.1,73.7,418.2,0.202,0.045,-2.455,6.7", "598.1,73.7,418.2"])
+def test_the_shift_that_a_system_gives_itself_counts_for_earth_centred_metres_too(tmp_path, datum, values):
+    """As for the latitude and longitude of the same place, whether PROJ knows the datum or not."""
+    wkt = f'GEOGCS["Mine",DATUM["{datum}",SPHEROID["Bessel 1841",6377397.155,299.1528128],TOWGS84[{values}]],'
+    wkt += 'PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328]]'
+    flat, _ = to_geodetic(wkt, tmp_path)
+    pyproj = pytest.importorskip("pyproj")
+    to_metres = pyproj.Transformer.from_crs(
+        "+proj=longlat +ellps=bessel", "+proj=geocent +ellps=bessel", always_xy=True
+    )
+    places = np.array(to_metres.transform([11.5], [48.1], [0.0])).T
+    found = geocentric_to_geodetic(wkt, tmp_path)(places)
+    assert found[0, :2] == pytest.approx(flat(np.array([[11.5, 48.1, 0.0]]))[0, :2], abs=1e-8)
+    both = f'COMPD_CS["both",{wkt},VERT_CS["h",VERT_DATUM["E",2002],UNIT["metre",1]]]'
+    assert geocentric_to_geodetic(both, tmp_path)(places) == pytest.approx(found)
 
 
 def test_names_of_files_are_not_looked_up_among_systems(monkeypatch):

@@ -297,6 +297,10 @@ def test_a_lens_of_meshroom_that_is_not_read_is_named(tmp_path: Path, flight: Kn
     file.write_text(file.read_text().replace('"brown"', '"3deanamorphic4"'))
     with pytest.raises(CaptureError, match="lens 7 is '3deanamorphic4'; read are pinhole"):
         read(tmp_path, "alicevision")
+    undone = '"undistortionType": "3deanamorphic4", "undistortionParams": ["0", "0.02"], "type": "pinhole"'
+    file.write_text(file.read_text().replace('"type": "3deanamorphic4"', undone))
+    with pytest.raises(CaptureError, match="lens 7 is 'pinhole 3deanamorphic4'; read are pinhole"):
+        read(tmp_path, "alicevision")
 
 
 @pytest.mark.parametrize("program", ["pix4d", "opf"])
@@ -320,6 +324,13 @@ def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, fli
     with pytest.raises(CaptureError, match="10 lines"):
         read(tmp_path, "pix4d")
     file.write_text(whole)
+    offset = file.with_name("flight_offset.xyz")
+    kept = offset.read_text()
+    offset.unlink()
+    lost = read(tmp_path, "pix4d")
+    assert lost.georef is None or lost.georef.origin is None
+    assert any("flight_offset.xyz is missing" in each for each in lost.warnings)
+    offset.write_text(kept)
     for wkt in ('LOCAL_CS["site",UNIT["metre",1]]', "Site grid 7"):
         file.with_name("flight_wkt.prj").write_text(wkt)
         source = read(tmp_path, "pix4d")

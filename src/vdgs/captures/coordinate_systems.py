@@ -282,7 +282,8 @@ def in_units_of(header: str, meters: float, file: Path) -> float:
 
 
 def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
-    """What brings Earth-centred metres of the datum of a system to latitude, longitude and height of WGS 84."""
+    """What brings Earth-centred metres of the datum of a system to latitude, longitude and height of WGS 84: by the
+    shift that the system gives itself (TOWGS84), or as PROJ knows its datum."""
     if re.search(r"EPSG:4326|GEOG(CS|CRS|RAPHICCRS)\[\s*\"WGS[ _]?(19)?84", header, re.I):
         return geodetic_from_ecef
     try:
@@ -292,8 +293,9 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
         raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
     try:
         crs = pyproj.CRS.from_user_input(_named(header))
-        plain = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
-        datum = (plain.geodetic_crs or plain).datum
+        if (shift := _own_shift(crs)) is not None:
+            return lambda places: geodetic_from_ecef(np.stack(shift.transform(*places.T), axis=1))
+        datum = (crs.geodetic_crs or crs).datum
         change = pyproj.Transformer.from_crs(GeocentricCRS(datum=datum), "EPSG:4979", always_xy=True)
     except (pyproj.exceptions.ProjError, TypeError, AttributeError):
         raise UnknownSystem(f"{file}: the coordinate system {header[:60]!r} is not understood.", header) from None
@@ -303,6 +305,23 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
         return np.stack([latitude, longitude, height], axis=1)
 
     return changed
+
+
+#: The parameters of TOWGS84, as PROJ names them; the first three may stand alone.
+_HELMERT = ("x", "y", "z", "rx", "ry", "rz", "s")
+
+
+def _own_shift(crs: Any) -> Any | None:
+    """The transformer of Earth-centred metres by the parameters of TOWGS84 (a Helmert transformation, EPSG's position
+    vector convention, rotations in seconds of arc, scale in ppm); None where the system gives none."""
+    import pyproj
+
+    bound = next((part for part in (crs, *crs.sub_crs_list) if part.is_bound), None)
+    values = list(bound.coordinate_operation.towgs84) if bound is not None and bound.coordinate_operation else []
+    if len(values) not in (3, 7):
+        return None
+    words = " ".join(f"+{name}={value}" for name, value in zip(_HELMERT, values, strict=False))
+    return pyproj.Transformer.from_pipeline(f"+proj=helmert {words} +convention=position_vector")
 
 
 def _named(header: str) -> str:

@@ -8,6 +8,7 @@ the coordinates of the system that *_wkt.prj names.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,9 @@ _ENDING, _HEADER = "_calibrated_camera_parameters.txt", "fileName imageWidth ima
 #: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
 _FOLDERS = ("params", "1_initial/params")
 _LINES = 10
+#: What was taken off positions; and how far from zero a place of a projected system lies at least (choice, metres or
+#: feet): eastings or northings are of hundreds of kilometres.
+_OFFSET, _FAR = "_offset.xyz", 20_000.0
 
 
 def find_files(root: Path) -> list[Path]:
@@ -58,15 +62,21 @@ def read(file: Path, options: CaptureOptions) -> Project:
             "fisheye, which is read from OPF (PIX4Dmatic). Copy or export it again."
         )
     views = tuple(_view(rows[first : first + _LINES], file) for first in range(0, len(rows), _LINES))
-    unknown = ""
+    unknown, warnings = "", tuple[str, ...]()
     try:
         system, place, is_metric, frames = _system(file)
     except UnknownSystem as error:
         system, place, is_metric, frames, unknown = None, "", True, (), error.definition
+    if system is not None and _is_offset_lost(file, views):
+        system, place, is_metric, frames = None, "Pix4D, metres of a system of its own", True, ()
+        warnings = (
+            f"{_beside(file, _OFFSET).name} is missing, from which the positions in {file.name} are counted: the scene "
+            "has no place on Earth. Copy the file there too.",
+        )
     return Project(
         format="pix4d", file=file, views=views, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8),
         to_geodetic=system, is_metric=is_metric, place=place, cloud_frames=frames,
-        unknown_system=unknown,
+        unknown_system=unknown, warnings=warnings,
     )  # fmt: skip
 
 
@@ -94,8 +104,7 @@ def _view(block: list[str], file: Path) -> ProjectView:
 def _system(file: Path) -> tuple[ToGeodetic | None, str, bool, tuple[CloudFrame, ...]]:
     """What brings coordinates to latitude, longitude and height, words about it, whether they are metres, and what a
     point cloud beside them may be in."""
-    stem = file.name.removesuffix(_ENDING)
-    offset_file, system_file = (file.with_name(f"{stem}{ending}") for ending in ("_offset.xyz", "_wkt.prj"))
+    offset_file, system_file = _beside(file, _OFFSET), _beside(file, "_wkt.prj")
     offset = np.zeros(3)
     if offset_file.is_file():
         offset = np.array(xml_numbers(_text(offset_file), 3, offset_file, "the offset"))
@@ -106,6 +115,20 @@ def _system(file: Path) -> tuple[ToGeodetic | None, str, bool, tuple[CloudFrame,
     # One camera model holds for x, y and z, which so have one unit.
     change, name = to_geodetic(wkt, system_file, "the file", heights_as_xy=True)
     return lambda points: change(points + offset), f"Pix4D, {name}", False, ((f"of {name}", change),)
+
+
+def _beside(file: Path, ending: str) -> Path:
+    """The file of the same project with another ending."""
+    return file.with_name(f"{file.name.removesuffix(_ENDING)}{ending}")
+
+
+def _is_offset_lost(file: Path, views: Sequence[ProjectView]) -> bool:
+    """Whether positions are as near to zero as no place of a projected system is that is used there, without the file
+    that says what they are counted from."""
+    if not views or _beside(file, _OFFSET).is_file():
+        return False
+    centers = np.stack([-view.camera_from_world[:3, :3].T @ view.camera_from_world[:3, 3] for view in views])
+    return bool(np.abs(np.median(centers[:, :2], axis=0)).max() < _FAR)
 
 
 def _text(file: Path) -> str:

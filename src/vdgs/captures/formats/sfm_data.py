@@ -200,8 +200,12 @@ def _openmvg_lens(entry: JsonObject, file: Path) -> Intrinsics | str:
 
 
 def _alicevision_kind(entry: JsonObject) -> str:
-    """A lens of AliceVision in one word or two; since version 1.2.7 the distortion has a word of its own."""
+    """A lens of AliceVision in one word or two; since version 1.2.7 the distortion has a word of its own, as a measured
+    undistortion has (anamorphic lenses), which counts instead of the distortion where it has parameters."""
     kind, bend = str(entry.get("type", "")).lower(), str(entry.get("distortionType") or "none").lower()
+    undone, values = str(entry.get("undistortionType") or "none").lower(), entry.get("undistortionParams")
+    if undone != "none" and isinstance(values, list) and any(re.search("[1-9]", str(value)) for value in values):
+        return f"{kind} {undone}"
     if bend == "none" or kind not in ("pinhole", "equidistant"):
         return kind
     return bend if kind == "pinhole" else f"{kind} {bend}"
