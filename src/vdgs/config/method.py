@@ -158,9 +158,9 @@ class LossConfig:
     """Standard deviation of the factor by which the opacity of each Gaussian is multiplied in a step: Gaussians that
     make a surface only together, spread in depth, come apart (choice)."""
     pseudo_views: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
-    """Weight of views that nobody photographed, nearer and more tilted than a photograph: every fifth step also draws
+    """Weight of views that nobody photographed, nearer and more tilted than a photograph: every fourth step also draws
     one, of 0.7 of the width and height, and compares it with the photograph where depths agree. 0.3 makes views from
-    where nobody flew better, for a tenth more time (choice)."""
+    where nobody flew better, for an eighth more time (choice)."""
     background: Literal["mean", "black"] = "mean"
     """Color behind the scene: the mean of the training photographs (choice), or black."""
     random_background: Annotated[float, FRACTION] = 1.0

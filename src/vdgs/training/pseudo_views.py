@@ -23,7 +23,7 @@ from vdgs.kernels.transfer import to_like, upload
 from vdgs.training.target import TrainingTarget
 
 #: Every so many steps draw a pseudo view, after this share of the iterations: before it depths are vague.
-EVERY, START_FRACTION = 5, 0.3
+EVERY, START_FRACTION = 4, 0.3
 #: Its width and height, in those of the photograph, which tells no more of a place that is nearer.
 SIZE = 0.7
 #: In degrees: by how much more a pseudo view is tilted than its photograph, and up to what tilt; how far it is turned
