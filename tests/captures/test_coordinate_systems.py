@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vdgs.captures.coordinate_systems import datum_error, geocentric_to_geodetic, names_a_system, to_geodetic
+from vdgs.captures.coordinate_systems import (
+    datum_error,
+    false_origin,
+    geocentric_to_geodetic,
+    names_a_system,
+    to_geodetic,
+)
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.errors import CaptureError
 
@@ -179,6 +185,13 @@ def test_the_shift_that_a_system_gives_itself_counts_for_earth_centred_metres_to
     assert found[0, :2] == pytest.approx(flat(np.array([[11.5, 48.1, 0.0]]))[0, :2], abs=1e-8)
     both = f'COMPD_CS["both",{wkt},VERT_CS["h",VERT_DATUM["E",2002],UNIT["metre",1]]]'
     assert geocentric_to_geodetic(both, tmp_path)(places) == pytest.approx(found)
+
+
+def test_false_origins_are_those_of_the_systems():
+    pytest.importorskip("pyproj")
+    codes = {"EPSG:32719": (5e5, 1e7), "EPSG:6677": (0, 0), "EPSG:2056": (2.6e6, 1.2e6), "EPSG:2154": (7e5, 6.6e6)}
+    assert {code: false_origin(code) for code in (*codes, "EPSG:4326")} == codes | {"EPSG:4326": (0, 0)}
+    assert false_origin("EPSG:25832+7837") == (5e5, 0)
 
 
 def test_names_of_files_are_not_looked_up_among_systems(monkeypatch):

@@ -250,6 +250,20 @@ def test_the_same_command_takes_no_frame_twice_and_other_films_are_refused(
     assert {photo.path for photo in again} == before.keys()
 
 
+def test_a_film_that_is_replaced_while_its_frames_are_taken_is_another(flight: Path, tmp_path: Path, monkeypatch):
+    film, output = Path(shutil.copy(flight, tmp_path / "a.mp4")), tmp_path / "out"
+    taken = take_frames._take_frames
+
+    def replaced(path: Path, *arguments):
+        record = taken(path, *arguments)
+        path.write_bytes(path.read_bytes() + bytes(1))
+        return record
+
+    monkeypatch.setattr(take_frames, "_take_frames", replaced)
+    take(ask(output, film))
+    assert film_changes(output) == "films: 1 changed (a.mp4)"
+
+
 def test_a_stop_while_frames_are_taken_leaves_an_output_that_goes_on(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -20,6 +20,7 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line, status_json
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
+from vdgs.sfm.reconstruction_plan import check_output_folder
 from vdgs.sfm.run_request import make_sfm_request
 from vdgs.sfm.source_images import SourceImages, check_unchanged
 from vdgs.system.atomic_files import write_json
@@ -113,6 +114,22 @@ def test_photographs_that_were_copied_or_touched_are_the_same(run, card, tmp_pat
         check_unchanged(run.own_capture, SourceImages.of([copied], read_digests(run.own_capture)), overwrite=False)
 
 
+def test_what_cannot_be_read_says_nothing_of_changes(run, card):
+    digests = read_digests(run.own_capture)
+    before = SourceImages.read(run.own_capture)
+    unknown = replace(before, files=tuple(replace(each, digest="") for each in before.files))
+    assert SourceImages.of([card], digests).changes_since(unknown) == ""
+    assert unknown.changes_since(before) == ""
+
+
+def test_a_folder_with_nothing_but_digests_is_one_of_a_run_that_was_ended_early(tmp_path):
+    (tmp_path / "digests.json").write_text("{}")
+    check_output_folder(tmp_path)
+    (tmp_path / "mine.txt").write_text("")
+    with pytest.raises(VdgsError, match="holds other things"):
+        check_output_folder(tmp_path)
+
+
 def test_a_file_is_read_again_only_where_its_size_or_time_is_another(card, tmp_path, monkeypatch):
     record, files = tmp_path / "digests.json", sorted(card.iterdir())
     first = ContentDigests.read(record)
@@ -126,6 +143,9 @@ def test_a_file_is_read_again_only_where_its_size_or_time_is_another(card, tmp_p
     assert again.of_all(files) == found
     assert [path for path in read if path in files] == files[:1]
     assert again.of(tmp_path / "none.jpg") == ""
+    read.clear()
+    assert len(ContentDigests.read(tmp_path / "other.json").of_all(files[:1] * 6)) == 1
+    assert read.count(files[0]) == 1
 
 
 def test_a_run_of_another_capture_has_no_photographs(run, tmp_path):

@@ -311,6 +311,22 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
 _HELMERT = ("x", "y", "z", "rx", "ry", "rz", "s")
 
 
+def false_origin(header: str) -> tuple[float, float]:
+    """What a projected system adds to its eastings and northings, in its unit; 0, 0 for other systems."""
+    import pyproj
+
+    crs = pyproj.CRS.from_user_input(_named(header))
+    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    crs = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+    if not crs.is_projected or crs.coordinate_operation is None:
+        return 0.0, 0.0
+    values = {each.name.lower(): float(each.value) for each in crs.coordinate_operation.params}
+    east, north = (
+        next((value for name, value in values.items() if word in name), 0.0) for word in ("easting", "northing")
+    )
+    return east, north
+
+
 def _own_shift(crs: Any) -> Any | None:
     """The transformer of Earth-centred metres by the parameters of TOWGS84 (a Helmert transformation, EPSG's position
     vector convention, rotations in seconds of arc, scale in ppm); None where the system gives none."""

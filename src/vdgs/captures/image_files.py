@@ -26,6 +26,7 @@ from vdgs.captures.optional_decoders import has_decoder, prepare_heif
 from vdgs.captures.raw_files import RAW_SUFFIXES, develop, is_raw, raw_size
 from vdgs.captures.strays import is_hidden
 from vdgs.captures.tiff_orientation import stored_size, without_orientation
+from vdgs.captures.xmp_packets import exif_of
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
 from vdgs.system.native_messages import without_decoder_messages
@@ -150,7 +151,7 @@ def has_camera(path: Path) -> bool:
         return True
     try:
         with pillow_without_limits(), Image.open(path) as image:
-            return not _CAMERA_TAGS.isdisjoint(image.getexif())
+            return not _CAMERA_TAGS.isdisjoint(exif_of(image))
     except Exception:  # Pillow's parsers raise many kinds on damaged headers
         return False
 
@@ -159,7 +160,7 @@ def is_turned(path: Path) -> bool:
     """Whether EXIF says that an image is to be shown turned by a quarter, which the pixels of its file are not."""
     try:
         with open_image(path) as image:
-            return image.getexif().get(_ORIENTATION) in (5, 6, 7, 8)
+            return exif_of(image).get(_ORIENTATION) in (5, 6, 7, 8)
     except Exception:  # Pillow's parsers raise many kinds on damaged headers
         return False
 

@@ -71,8 +71,9 @@ def _profile(image: Image.Image, name: str) -> bytes:
     """A profile that ImageMagick wrote into the text of a PNG before the pixels; empty for none, and for nonsense."""
     written = image.info.get(f"Raw profile type {name}")
     match = _PROFILE.match(written[: 8 * MAX_XMP_BYTES]) if isinstance(written, str) else None
+    digits = "".join(match[1].split()) if match else ""
     try:
-        return bytes.fromhex(match[1]) if match else b""
+        return bytes.fromhex(digits[: len(digits) // 2 * 2])
     except ValueError:
         return b""
 

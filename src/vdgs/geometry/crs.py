@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -153,9 +154,10 @@ def _operation(crs: Any, code: str, origin: tuple[float, float, float]) -> tuple
         )
     notes = []
     if elsewhere:
-        area_name = found.area_of_use.name if found.area_of_use else "elsewhere"
+        area = shorten(found.area_of_use.name if found.area_of_use else "elsewhere", 60, placeholder=" ...")
         notes.append(
-            f"{crs.name} is reached by a datum shift that is made for {area_name}; here it may be off by metres."
+            f"{crs.name} is reached by a datum shift that is made for {area}; here coordinates may be off by tens of "
+            f"metres.{missing}"
         )
     elif _is_ballpark(found):
         notes.append(

@@ -121,10 +121,11 @@ def is_contradicted(
     said = {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
     if not held[0] or held[1] == ASKED or not said:
         return False
-    as_held, fitted = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
-    as_held.update_point_3d_errors()
+    fitted = pycolmap.Reconstruction(model)
+    fitted.update_point_3d_errors()
+    as_held = fitted.compute_mean_reprojection_error()
     _fit_focal(fitted, threads)
-    nearer = 1 - fitted.compute_mean_reprojection_error() / as_held.compute_mean_reprojection_error()
+    nearer = 1 - fitted.compute_mean_reprojection_error() / as_held
     return nearer >= CLEARLY_NEARER and any(
         not alike(fitted.cameras[k].mean_focal_length(), focal) for k, focal in said.items() if k in fitted.cameras
     )

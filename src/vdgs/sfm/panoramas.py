@@ -53,9 +53,9 @@ def _views(photo: ImageMetadata, kind: int) -> list[ImageMetadata]:
     folder = "pano" if kind == 0 else f"pano{kind + 1}"
     return [
         replace(
-            photo, name=f"{folder}_{face}/{photo.name}", width=side, height=side, lens=Lens(0.5, _SOURCE),
-            camera=f"{photo.camera}, {face}", attitude=None, frame=photo.name, face=face, camera_model=EXACT_MODEL,
-            kind="", is_panorama=False, whole_size=photo.size,
+            photo, name=f"{folder}_{face}/{photo.name}", width=side, height=side,
+            lens=Lens(0.5, _SOURCE, confirmed=True), camera=f"{photo.camera}, {face}", attitude=None, frame=photo.name,
+            face=face, camera_model=EXACT_MODEL, kind="", is_panorama=False, whole_size=photo.size,
         )
         for face in FACES
     ]  # fmt: skip

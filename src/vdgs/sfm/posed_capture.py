@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
 from vdgs.captures.output_guard import check_output
-from vdgs.captures.reconstruction import STEPS_FILE, WORK_FOLDER
+from vdgs.captures.reconstruction import DIGESTS_FILE, STEPS_FILE, WORK_FOLDER
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.captures.up_axis import estimate_up
 from vdgs.config.capture_options import CaptureOptions
@@ -80,6 +81,8 @@ def make_posed_capture(
         console.print(f"[yellow]note[/] {warning}", highlight=False)
     if finished.is_done(CAPTURE, photographs.keys[CAPTURE]):
         console.print(f"{output}: made of these poses already; nothing to do", highlight=False)
+        with suppress(VdgsError):  # it saves reading, and the folder may be read-only
+            photographs.digests.write()
         return
     check_posed_output(photographs)
     check_nothing_trained(request, run)
@@ -109,7 +112,7 @@ def check_posed_output(photographs: PosedPhotographs) -> None:
     request, output = photographs.request, photographs.request.output
     work, finished = Workspace(output / WORK_FOLDER), Workspace(output)
     check_output(output)
-    if not output.exists() or (output.is_dir() and not any(each.name != ".lock" for each in output.iterdir())):
+    if not output.exists() or (output.is_dir() and {each.name for each in output.iterdir()} <= {".lock", DIGESTS_FILE}):
         return
     begun = (work.path / STEPS_FILE).is_file() or (output / STEPS_FILE).is_file()
     if not begun:

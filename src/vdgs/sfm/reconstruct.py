@@ -334,8 +334,8 @@ def _models(
 ) -> list[pycolmap.Reconstruction]:
     if not workspace.is_done("model", key):
         if not workspace.is_begun("model", key):
+            workspace.forget("model", "joined", "rigs")  # before: what is done is read
             incremental_mapper.delete_models(workspace)
-            workspace.forget("joined", "rigs")
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
         workspace.finish("model", key)

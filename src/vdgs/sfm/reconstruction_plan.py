@@ -10,6 +10,7 @@ from rich.console import Console
 
 from vdgs.captures.output_guard import check_output
 from vdgs.captures.reconstruction import (
+    DIGESTS_FILE,
     FILMS_FILE,
     FRAMES_FOLDER,
     SOURCE_IMAGES_FILE,
@@ -187,6 +188,7 @@ def _has_foreign_files(output: Path) -> bool:
         ".lock",
         POSITIONS_FIGURE,
         SOURCE_IMAGES_FILE,
+        DIGESTS_FILE,
         FILMS_FILE,
         FRAMES_FOLDER,
         *([WORK_FOLDER] if begun else []),

@@ -16,10 +16,10 @@ from vdgs.system.units import first_names
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A photograph: its name in the capture, and the digest of its file."""
+    """A photograph: its name in the capture, and the digest of its file; empty where it is not known."""
 
     name: str
-    digest: str
+    digest: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,8 @@ class SourceImages:
     def changes_since(self, before: SourceImages) -> str:
         """2 photographs added (a.jpg, b.jpg), 1 removed (c.jpg); empty where nothing changed."""
         old, new = ({each.name: each for each in files} for files in (before.files, self.files))
-        changed = [name for name in old.keys() & new.keys() if old[name] != new[name]]
+        pairs = {name: (old[name].digest, new[name].digest) for name in old.keys() & new.keys()}
+        changed = [name for name, (before_it, now) in pairs.items() if before_it and now and before_it != now]
         kinds = (("added", new.keys() - old.keys()), ("removed", old.keys() - new.keys()), ("changed", changed))
         parts = [f"{len(names)} {kind} ({first_names(sorted(names))})" for kind, names in kinds if names]
         return f"photographs: {', '.join(parts)}" if parts else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vdgs import __version__
+from vdgs.errors import CaptureError
 from vdgs.sfm.image_metadata import RADIAL
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import cache_key
@@ -13,9 +14,12 @@ from vdgs.system.records import record_to_dict
 
 
 def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, str]:
-    """What each step depends on, each on those before it. All but the last do not depend on what places the scene."""
+    """What each step depends on, each on those before it. All but the last do not depend on what places the scene.
+    Raises CaptureError for a photograph that cannot be read."""
     options, positions = plan.request.options, plan.gps_priors
     content = digests.of_all(photo.path for photo in plan.image_list.images)
+    if lost := [path for path, digest in content.items() if not digest]:
+        raise CaptureError(f"{lost[0]}: cannot be read any more. See to the disk, then run the same command again.")
     files = [
         (photo.name, content[photo.path], photo.width, photo.height, photo.orientation)
         for photo in plan.image_list.images

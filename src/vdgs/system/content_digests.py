@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from hashlib import blake2b, file_digest
+from hashlib import blake2b
 from pathlib import Path
 
 from vdgs.system.atomic_files import read_json_or_empty, write_json
@@ -13,6 +13,8 @@ from vdgs.system.stop_signals import check_stop_requested
 
 #: Files that are read at the same time: the digest of one is computed while the disk serves others.
 _READERS = 4
+#: Bytes that are read at once; between two such parts a stop is heard.
+_PART_BYTES = 1 << 22
 #: What a digest is kept with: size and time of the file, by which a file is known that did not change.
 _Known = list[int | str]
 
@@ -28,9 +30,9 @@ class ContentDigests:
     @staticmethod
     def read(record: Path) -> ContentDigests:
         """Those of a record; none where there is no such file."""
-        return ContentDigests(record, {
-            name: known for name, known in read_json_or_empty(record).items() if isinstance(known, list)
-        })  # fmt: skip
+        found = read_json_or_empty(record).items()
+        known = {name: each for name, each in found if isinstance(each, list) and len(each) == 3}
+        return ContentDigests(record, known)
 
     def of(self, path: Path) -> str:
         """The digest of a file; empty for one that cannot be read."""
@@ -40,8 +42,7 @@ class ContentDigests:
             stamp = [status.st_size, status.st_mtime_ns]
             known = self._known.get(name)
             if known is None or known[:2] != stamp:
-                with path.open("rb") as file:
-                    known = [*stamp, file_digest(file, lambda: blake2b(digest_size=16)).hexdigest()]
+                known = [*stamp, _digest(path)]
                 self._known[name], self._is_new = known, True
             return str(known[2])
         except OSError:
@@ -49,7 +50,7 @@ class ContentDigests:
 
     def of_all(self, paths: Iterable[Path]) -> dict[Path, str]:
         """The digest of each file."""
-        files = list(paths)
+        files = list(dict.fromkeys(paths))
         with ThreadPoolExecutor(_READERS) as pool:
             return dict(zip(files, pool.map(self.of, files), strict=True))
 
@@ -58,3 +59,13 @@ class ContentDigests:
         if self._is_new:
             write_json(self.record, self._known)
             self._is_new = False
+
+
+def _digest(path: Path) -> str:
+    """Of the content of a file. Raises OSError where it cannot be read, and what asked to stop."""
+    digest = blake2b(digest_size=16)
+    with path.open("rb") as file:
+        while part := file.read(_PART_BYTES):
+            check_stop_requested()
+            digest.update(part)
+    return digest.hexdigest()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, false_origin, is_local_system, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
@@ -26,9 +26,9 @@ _ENDING, _HEADER = "_calibrated_camera_parameters.txt", "fileName imageWidth ima
 #: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
 _FOLDERS = ("params", "1_initial/params")
 _LINES = 10
-#: What was taken off positions; and how far from zero a place of a projected system lies at least (choice, metres or
-#: feet): eastings or northings are of hundreds of kilometres.
-_OFFSET, _FAR = "_offset.xyz", 20_000.0
+#: What was taken off positions. Without the file, those nearer to zero than the first are differences where the system
+#: has a false origin beyond the second (choice; metres or feet).
+_OFFSET, _NEAR, _FALSE_ORIGIN = "_offset.xyz", 20_000.0, 100_000.0
 
 
 def find_files(root: Path) -> list[Path]:
@@ -68,7 +68,7 @@ def read(file: Path, options: CaptureOptions) -> Project:
     except UnknownSystem as error:
         system, place, is_metric, frames, unknown = None, "", True, (), error.definition
     if system is not None and _is_offset_lost(file, views):
-        system, place, is_metric, frames = None, "Pix4D, metres of a system of its own", True, ()
+        system, place, is_metric, frames = None, "", False, ()
         warnings = (
             f"{_beside(file, _OFFSET).name} is missing, from which the positions in {file.name} are counted: the scene "
             "has no place on Earth. Copy the file there too.",
@@ -123,12 +123,14 @@ def _beside(file: Path, ending: str) -> Path:
 
 
 def _is_offset_lost(file: Path, views: Sequence[ProjectView]) -> bool:
-    """Whether positions are as near to zero as no place of a projected system is that is used there, without the file
-    that says what they are counted from."""
+    """Whether positions are as near to zero as no place of their system is, without the file that says what they are
+    counted from: systems with a false origin are made so that eastings and northings are large."""
     if not views or _beside(file, _OFFSET).is_file():
         return False
     centers = np.stack([-view.camera_from_world[:3, :3].T @ view.camera_from_world[:3, 3] for view in views])
-    return bool(np.abs(np.median(centers[:, :2], axis=0)).max() < _FAR)
+    if np.abs(np.median(centers[:, :2], axis=0)).max() >= _NEAR:
+        return False
+    return max(map(abs, false_origin(_text(_beside(file, "_wkt.prj")).strip()))) >= _FALSE_ORIGIN
 
 
 def _text(file: Path) -> str:

@@ -49,15 +49,16 @@ class FilmRecord:
     """A film whose frames were taken."""
 
     film: str
-    digest: str
-    """Of its file."""
     most: int
     """The bound on its frames."""
     frames: int
     summary: str
+    digest: str = ""
+    """Of its file; empty where it is not known."""
 
-    def is_of(self, film: Path, digests: ContentDigests, most: int) -> bool:
-        return (self.film, self.digest, self.most) == (str(film.resolve()), digests.of(film), most)
+    def is_of(self, film: Path, content: Mapping[Path, str], most: int) -> bool:
+        """Whether it is of a film, whose digest is in `content`."""
+        return (self.film, self.digest or None, self.most) == (str(film.resolve()), content[film], most)
 
 
 @contextmanager
@@ -87,16 +88,17 @@ def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = N
     check_ranges(request)
     check_output(request.output)
     check_output_folder(request.output)
+    digests = read_digests(request.output)
     if (request.output / SOURCE_IMAGES_FILE).exists() and not request.overwrite:
-        _check_same(request, films)
+        _check_same(request, films, digests)
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
-        return replace(request, image_folders=_take(request, request.output, console))
+        return replace(request, image_folders=_take(request, request.output, console, digests))
 
 
-def _check_same(request: SfmRequest, films: Sequence[Path]) -> None:
+def _check_same(request: SfmRequest, films: Sequence[Path], digests: ContentDigests) -> None:
     """Raise VdgsError where the capture that is there was begun with other films or another bound on their frames."""
     before = _records(request.output)
-    changes = _changes(before, films, read_digests(request.output))
+    changes = _changes(before, films, digests)
     if before and not changes:
         bounds = _bounds(films, request.options.num_frames)
         if sorted(record.most for record in before.values()) != sorted(bounds):
@@ -119,10 +121,10 @@ def film_changes(output: Path) -> str:
 
 def _changes(before: Mapping[str, FilmRecord], films: Sequence[Path], digests: ContentDigests) -> str:
     known, now = {record.film: record for record in before.values()}, {str(film.resolve()): film for film in films}
-    same = known.keys() & now.keys()
+    same, content = known.keys() & now.keys(), digests.of_all(films)
     kinds = {
         "added": now.keys() - known.keys(), "removed": known.keys() - now.keys(),
-        "changed": {name for name in same if not known[name].is_of(now[name], digests, known[name].most)},
+        "changed": {name for name in same if not known[name].is_of(now[name], content, known[name].most)},
     }  # fmt: skip
     parts = [
         f"{len(names)} {kind} ({first_names(sorted(Path(name).name for name in names))})"
@@ -141,8 +143,11 @@ def _records(output: Path) -> dict[str, FilmRecord]:
         return {}
 
 
-def _take(request: SfmRequest, output: Path, console: Console) -> tuple[Path, ...]:
-    """The folders of photographs: those of the request, and the folder of frames."""
+def _take(
+    request: SfmRequest, output: Path, console: Console, digests: ContentDigests | None = None
+) -> tuple[Path, ...]:
+    """The folders of photographs: those of the request, and the folder of frames; without `digests` nobody asks later
+    whether films are others."""
     films, folder = films_in(request.image_folders), output / FRAMES_FOLDER
     names, before = _folder_names(films), _records(output)
     most = _bounds(films, request.options.num_frames)
@@ -150,17 +155,22 @@ def _take(request: SfmRequest, output: Path, console: Console) -> tuple[Path, ..
         if rest.is_dir() and rest.name not in names:
             shutil.rmtree(rest)
     bounds = dict(zip(names, zip(films, most, strict=True), strict=True))
-    digests, kept = read_digests(output), [name for name in before if name in names and (folder / name).is_dir()]
-    records = {name: before[name] for name in kept if before[name].is_of(bounds[name][0], digests, bounds[name][1])}
+    content = {film: "" if digests is None else digests.of(film) for film in films}  # before frames are taken
+    records = {
+        name: record
+        for name, record in before.items()
+        if name in names and (folder / name).is_dir() and record.is_of(bounds[name][0], content, bounds[name][1])
+    }
     _write_records(output, records)
     for name, (film, bound) in bounds.items():
         if name not in records:
             taken = _take_frames(film, folder / name, bound, Workspace(output / WORK_FOLDER), console)
-            records[name] = replace(taken, digest=digests.of(film))
+            records[name] = replace(taken, digest=content[film])
             _write_records(output, records)
-            digests.write()
         known = records[name]
         console.print(escape(f"{film.name}: {known.summary}"), highlight=False)
+    if digests is not None:
+        digests.write()
     count = sum(record.frames for record in records.values())
     others = tuple(path for path in request.image_folders if not films_in((path,)))
     if count < MIN_IMAGES and not others:
@@ -223,7 +233,7 @@ def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: 
             moment = _moment(film, records, known, moments[file])
             write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
         summary = _summary(film, len(chosen), placed, last, records, source)
-    return FilmRecord(film=str(path.resolve()), digest="", most=most, frames=len(chosen), summary=summary)
+    return FilmRecord(film=str(path.resolve()), most=most, frames=len(chosen), summary=summary)
 
 
 def _look(film: Film, chooser: FrameChooser[FilmFrame], tell) -> FilmFrame:  # type: ignore[no-untyped-def]

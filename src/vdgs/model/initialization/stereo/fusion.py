@@ -32,7 +32,7 @@ from vdgs.visibility.spatial_groups import SpatialGroups
 
 #: Photographs are matched at this longest side, and enlarged at most by so much: steps of a sixteenth of a column tell
 #: depth better in larger pictures (choice).
-MATCHING_SIDE_PX, MAX_UPSCALE = 384, 1.5
+MATCHING_SIDE_PX, MAX_UPSCALE = 480, 1.5
 #: Depths are looked for between these quantiles of a photograph's sparse points, and this much nearer and farther.
 DEPTH_QUANTILES, DEPTH_MARGIN = (0.01, 0.99), 0.2
 #: Edges of cells are the least one times these. Keys have room for so many.
