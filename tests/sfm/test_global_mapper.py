@@ -183,6 +183,14 @@ def test_a_focal_length_that_the_photographs_contradict_is_fitted_anew_and_work_
     assert made == [True, False, False]
 
 
+def test_models_that_are_deleted_to_be_made_anew_are_not_taken_for_done(copied, monkeypatch):
+    assert models_of(copied) == [16]
+    monkeypatch.setattr(incremental_mapper, "delete_models", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        models_of(copied, "other")
+    assert not copied.is_done("model", "key")
+
+
 def test_models_that_are_made_anew_are_joined_anew(copied):
     assert models_of(copied) == [16]
     copied.begin("model", "other")  # another focal length was asked for, and the work was stopped

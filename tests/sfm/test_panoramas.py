@@ -20,6 +20,7 @@ from vdgs.errors import VdgsError
 from vdgs.geometry.similarity import fit_similarity
 from vdgs.sfm.capture_writer import make_undistortion
 from vdgs.sfm.cube_faces import FACES, cut_face
+from vdgs.sfm.feature_extraction import group_by_camera
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.mask_files import read_keep_mask
 from vdgs.sfm.reconstruct import reconstruct
@@ -73,6 +74,8 @@ def test_panoramas_are_known_by_their_tags_or_asked_for(tmp_path):
     plan = plan_reconstruction(SfmRequest(image_folders=(tmp_path / "tagged",), output=tmp_path / "out"))
     assert len(plan.image_list.images) == 18
     assert plan.pairs == 3 * 36
+    groups = group_by_camera(plan.image_list.images)
+    assert all(group.has_focal_prior and group.is_confirmed for group in groups)  # exact: no adjustment doubts it
     request = SfmRequest(
         image_folders=(tmp_path / "tagged",), output=tmp_path / "out", options=SfmOptions(scale_bar=tmp_path / "bars")
     )

@@ -219,6 +219,8 @@ def test_a_look_refuses_an_output_that_the_work_refuses(town_flight: tuple[Path,
     (tmp_path / "full/thesis.txt").write_text("three years")
     with pytest.raises(VdgsError, match="holds other things"):
         plan_posed_capture(SfmRequest(image_folders=(root,), output=tmp_path / "full"), CaptureOptions())
+    (tmp_path / "full/thesis.txt").rename(tmp_path / "full/digests.json")  # of a run that was killed at once
+    plan_posed_capture(SfmRequest(image_folders=(root,), output=tmp_path / "full"), CaptureOptions())
 
 
 # ------------------------------------------------------------------------------------- data sets without points

@@ -153,14 +153,14 @@ class LossConfig:
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
     depth_agreement: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Weight of the mean difference between expected and median depth, in camera heights: better depth in views from
-    where nobody flew, for 3 to 6 % more time: every second step counts it, twice (choice)."""
+    where nobody flew, for 4 to 7 % more time: every second step counts it, twice (choice)."""
     opacity_noise: Annotated[float, Range(0, 1)] = 0.0
     """Standard deviation of the factor by which the opacity of each Gaussian is multiplied in a step: Gaussians that
     make a surface only together, spread in depth, come apart (choice)."""
     pseudo_views: Annotated[float, Range(0, MAX_FLOAT)] = 0.0
     """Weight of views that nobody photographed, nearer and more tilted than a photograph: every fourth step also draws
     one, of 0.7 of the width and height, and compares it with the photograph where depths agree. 0.3 makes views from
-    where nobody flew better, for an eighth more time (choice)."""
+    where nobody flew better, for a seventh more time (choice)."""
     background: Literal["mean", "black"] = "mean"
     """Color behind the scene: the mean of the training photographs (choice), or black."""
     random_background: Annotated[float, FRACTION] = 1.0
