@@ -320,7 +320,10 @@ def _mapped(
     if not workspace.is_begun("model", anew):
         models = _models(plan, workspace, key, count, held[0], console)
         held = incremental_mapper.release_focal(models, held, plan.threads)
+        if workspace.is_done("focal", key):
+            return models, held
         if not incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
+            workspace.finish("focal", key)
             return models, held
         console.print(
             "[yellow]note[/] the photographs contradict the focal length that is held; it is fitted, all anew",
@@ -334,7 +337,7 @@ def _models(
 ) -> list[pycolmap.Reconstruction]:
     if not workspace.is_done("model", key):
         if not workspace.is_begun("model", key):
-            workspace.forget("model", "joined", "rigs")  # before: what is done is read
+            workspace.forget("model", "joined", "rigs", "focal")  # before: what is done is read
             incremental_mapper.delete_models(workspace)
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 
@@ -39,6 +39,13 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
+
+
+def write_values(file: IO[bytes], values: np.ndarray) -> None:
+    """Write the bytes of an array to a buffered file. Raises OSError where the disk has no room for all of them;
+    `ndarray.tofile` loses the last block without a word."""
+    contiguous = values if values.flags.c_contiguous else values.copy(order="C")
+    file.write(contiguous.reshape(-1).view("u1").data)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from vdgs.export.formats.axes import Z_UP, Axes, axes_named
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomic, write_text
+from vdgs.system.atomic_files import write_atomic, write_text, write_values
 from vdgs.system.quoting import header_line
 
 MAX_HEADER_BYTES = 1 << 16
@@ -92,7 +92,7 @@ def write_vertices(
         with temporary.open("wb") as file:
             file.write("\n".join(lines).encode("ascii"))
             for piece in scene.pieces(axes):
-                rows_of(piece).tofile(file)
+                write_values(file, rows_of(piece))
 
     write_atomic(path, write)
     write_crs_beside(path, scene.metadata)

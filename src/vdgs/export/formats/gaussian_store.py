@@ -17,6 +17,7 @@ from vdgs.errors import RunError
 from vdgs.export.formats.axes import Z_UP, Axes
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene
 from vdgs.model.gaussians import Gaussians
+from vdgs.system.atomic_files import write_values
 
 #: Where a Gaussian's coefficients of the spherical harmonics begin: behind its mean, scales, quaternion and logit.
 GEOMETRY_VALUES = 3 + 3 + 4 + 1
@@ -84,7 +85,7 @@ def write_store(scene: ExportScene, file: Path, axes: Axes = Z_UP) -> GaussianSt
     with file.open("wb") as handle:
         for piece in scene.pieces(axes):
             shapes = shapes or {name: tuple(tensor.shape[1:]) for name, tensor in piece.tensors().items()}
-            flatten(piece).tofile(handle)
+            write_values(handle, flatten(piece))
             means[done : done + len(piece)] = piece.means.numpy()
             done += len(piece)
     with file.open("r+b") as handle:

@@ -26,7 +26,7 @@ from vdgs.export.formats.export_scene import (
     to_uint8,
 )
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomic
+from vdgs.system.atomic_files import write_atomic, write_values
 from vdgs.system.documents import JsonObject
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -99,7 +99,7 @@ def write_glb(path: Path, scene: ExportScene) -> tuple[str, ...]:
                 low, high = np.minimum(low, piece.means.numpy().min(0)), np.maximum(high, piece.means.numpy().max(0))
                 for column, start, values in zip(wanted, starts[:-1], _values(piece), strict=True):
                     file.seek(data + start + done * column.bytes_per_gaussian)
-                    values.tofile(file)
+                    write_values(file, values)
                 done += len(piece)
             file.seek(0)
             described = _json(_document(wanted, scene, starts, low, high)).ljust((room + 3) // 4 * 4)

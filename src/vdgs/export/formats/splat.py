@@ -25,7 +25,7 @@ from vdgs.export.formats.export_scene import (
 )
 from vdgs.kernels.spherical_harmonics import rgb_to_sh
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomic
+from vdgs.system.atomic_files import write_atomic, write_values
 
 SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -44,7 +44,7 @@ def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
                 rows["mean"], rows["scale"] = piece.means.numpy(), gaussian_scales(piece)
                 rows["rgba"] = to_uint8(np.concatenate([shown, opacities(piece)[:, None]], 1))
                 rows["rotation"] = np.clip(np.rint(piece.quaternions.numpy() * 128 + 128), 0, 255).astype(np.uint8)
-                rows.tofile(file)
+                write_values(file, rows)
 
     write_atomic(path, write)
     write_metadata_file(path, scene.metadata, axes)

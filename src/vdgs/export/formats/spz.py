@@ -33,7 +33,7 @@ from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_atomic
+from vdgs.system.atomic_files import write_atomic, write_values
 from vdgs.system.scratch import scratch_folder
 
 MAGIC = 0x5053474E
@@ -86,7 +86,7 @@ def write_spz(path: Path, scene: ExportScene) -> tuple[str, ...]:
                     for name, count in _count_clamped(piece).items():
                         cut[name] += count
                     for name, column in zip(COLUMN_NAMES, encode_columns(piece, version), strict=True):
-                        column.tofile(spools[name])
+                        write_values(spools[name], column)
                 with temporary.open("wb") as file:
                     if version == 4:
                         _write_streams(file, scene, spools)
