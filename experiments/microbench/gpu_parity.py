@@ -138,7 +138,7 @@ def decode_backward_adam(kernels: KernelBackend, scene: ParityScene) -> Results:
     gradients = SplatGradients(
         means_px=0.01 * scene.random(count, 2)[drawn], conics=scene.random(count, 3)[drawn],
         colors=scene.random(count, 3)[drawn], opacities=scene.random(count)[drawn], volume=0.1, source=splats.source,
-        color_values=splats.colors, opacity_values=splats.opacities,
+        color_values=splats.colors, opacity_values=splats.opacities, depths=scene.random(count, seed=2)[drawn],
     )  # fmt: skip
     states = [
         AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-3)
@@ -180,9 +180,9 @@ def rasterize(kernels: KernelBackend, scene: ParityScene) -> Results:
 
 
 def rasterize_vjp(kernels: KernelBackend, scene: ParityScene) -> Results:
-    raster, pullback = kernels.rasterize_vjp(scene.splats(), scene.background, scene.width, scene.height)
+    raster, pullback = kernels.rasterize_vjp(scene.splats(), scene.background, scene.width, scene.height, depth=True)
     shape = (scene.height, scene.width)
-    gradients = pullback(scene.random(*shape, 3), scene.random(*shape))._asdict()
+    gradients = pullback(scene.random(*shape, 3), scene.random(*shape), scene.random(*shape, seed=2))._asdict()
     named = {f"gradient {name}": gradient for name, gradient in gradients.items() if gradient is not None}
     return {"image": raster.image, "alpha": raster.alpha} | named
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,12 +11,11 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, expand_sources, pack_decoder
+from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, pack_decoder
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
 from vdgs.kernels.kernel_types import HIDDEN_SIZE, AdamState, DecoderWeights, IsFinite, SplatGradients
 from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_updates
-from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as torch_decode_backward_adam
 
 #: Anchors whose contributions to the decoder's gradients are stored at once: whole blocks.
 ANCHORS_PER_CHUNK = 2**16
@@ -39,13 +37,9 @@ def decode_backward_adam(
 
     A warp moves an anchor; its gradients are never stored. Gradients of the decoder are matrix products (by torch) over
     `chunk` anchors at a time, 1.4 kB each: 88 MB, of which fewer would be launches that take longer than the memory. An
-    anchor whose gradient is not finite does not move. With gradients by depth, torch computes everything. `lr_boost` is
-    the same for all of `moved`. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel
-    cannot be run.
+    anchor whose gradient is not finite does not move. `lr_boost` is the same for all of `moved`. Raises ValueError or
+    TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
-    if gradients.depths is not None:
-        named = replace(gradients, source=expand_sources(gradients.source, program=program))
-        return torch_decode_backward_adam(positions, moved, weights, camera, rows, named, updates)
     check_updates(updates, len(positions))
     features, offsets, _ = moved
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
@@ -64,6 +58,7 @@ def decode_backward_adam(
     after: list[KernelArgument] = [
         ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.segments.starts,
         *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities)),
+        None if gradients.depths is None else gradients.depths.contiguous(),
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())

@@ -244,7 +244,7 @@ struct Moved {
 // of its splats back to it, and its step of Adam. `first` is a multiple of kWarps; `shown` and `begins` say which offsets show
 // and where their splats are, as in `decode_anchors`. What these looked like is computed again, to the same bits. `updates`
 // [n] counts up; `lacking` and `roots` [t] hold 1 - beta1^u and 1 / sqrt(1 - beta2^u) of u = 1, 2, ... updates. `broken` [1]
-// becomes 1 where a gradient is no number: that anchor stays.
+// becomes 1 where a gradient is no number: that anchor stays. `by_depths` is null where no loss reads depths.
 // For the gradients of the decoder, by matrix products, with c for `count`: by the outputs of all heads [c, k + 7k + 3k],
 // hidden layers and by hidden layers [c, 3, 32], inputs [c, inputs]; all of these null where nobody wants them.
 extern "C" __global__ void __launch_bounds__(kThreads, 2)
@@ -257,7 +257,7 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
              const float* c_w2, const float* r_w1, const float* r_w2, vdgs::Camera camera, const long long* rows,
              long long first, long long count, int k, int inputs_wide, const unsigned* shown, const int* begins,
              const float* by_means_px, const float* by_conics, const float* by_colors, const float* by_opacities,
-             float by_volume, int* updates, const float* lacking, const float* roots, int most_updates, int* broken,
+             const float* by_depths, float by_volume, int* updates, const float* lacking, const float* roots, int most_updates, int* broken,
              float* by_outputs_out, float* hidden_out, float* by_hidden_out, float* inputs_out) {
   const long long place = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp, visible = first + place;
   if (place >= count) return;  // whole warps
@@ -306,7 +306,8 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
       const vdgs::Gaussian<float> gaussian = vdgs::spawn(anchor, offset, covariance);
       const vdgs::Projection<float> p = vdgs::project(camera, gaussian);
       const float *by_px = by_means_px + 2 * splat, *by_conic = by_conics + 3 * splat;
-      const vdgs::Footprint<float> by_drawn{by_px[0], by_px[1], 0.0f, by_conic[0], by_conic[1], by_conic[2]};
+      const float by_depth = by_depths ? by_depths[splat] : 0.0f;
+      const vdgs::Footprint<float> by_drawn{by_px[0], by_px[1], by_depth, by_conic[0], by_conic[1], by_conic[2]};
       vdgs::Gaussian<float> by_gaussian = vdgs::project_backward(camera, gaussian, p, by_drawn);
       const Vec3<float> s = gaussian.scale;
       by_gaussian.scale = by_gaussian.scale + by_volume * Vec3<float>{s.y * s.z, s.x * s.z, s.x * s.y};
