@@ -192,6 +192,12 @@ def splat_contributions(kernels: KernelBackend, scene: ParityScene) -> Results:
     return kernels.splat_contributions(scene.splats(), scene.background, scene.width, scene.height, target)._asdict()
 
 
+def photometric_loss_vjp(kernels: KernelBackend, scene: ParityScene) -> Results:
+    image = scene.random(scene.height, scene.width, 3).sigmoid()
+    found, gradient = kernels.photometric_loss_vjp(image, scene.target, None)
+    return found._asdict() | {"gradient": gradient}
+
+
 def photometric_loss(kernels: KernelBackend, scene: ParityScene) -> Results:
     image = scene.random(scene.height, scene.width, 3).sigmoid().requires_grad_(True)
     photometric = kernels.photometric_loss(image, scene.target, scene.mask)
@@ -324,8 +330,8 @@ CASES: dict[str, Callable[[KernelBackend, ParityScene], Results]] = {
     for case in (
         adam_rows, adam_tensors, add_view_statistics, cell_centers, cell_keys, contains, count_visibility, cull, decode,
         decode_for_training, decode_backward_adam, fade_factors, fit_harmonics, group_cells, group_max, harmonic_colors,
-        mark_visible, mean_ellipsoids, merged_splats, morton_order, photometric_loss, project, rasterize,
-        rasterize_vjp, splat_contributions,
+        mark_visible, mean_ellipsoids, merged_splats, morton_order, photometric_loss, photometric_loss_vjp, project,
+        rasterize, rasterize_vjp, splat_contributions,
     )
 }  # fmt: skip
 

@@ -57,6 +57,15 @@ def test_it_equals_the_reference(height, width, kept, program):
 
 
 @needs_a_compiler
+def test_without_autograd_it_is_the_same_to_the_bit(program):
+    image, target, mask = scene(17, 33, kept=0.7)
+    result, gradient = on_host(program, image, target, mask)
+    found, same_gradient = cuda.photometric_loss_vjp(image, target, mask, program=program)
+    assert torch.equal(gradient, same_gradient)
+    assert all(torch.equal(one.detach(), other) for one, other in zip(result, found, strict=True))
+
+
+@needs_a_compiler
 def test_no_barrier_is_missing(program, library):
     """The order in which the threads of a block take turns changes no bit."""
     image, target, mask = scene(40, 35, kept=0.8)

@@ -71,6 +71,11 @@ def loss():
     return *found, *torch.autograd.grad(found.loss, image)
 
 
+def loss_vjp():
+    found, gradient = cpu.photometric_loss_vjp(floats(20, 30, 3, low=0.0), torch.zeros(20, 30, 3, dtype=torch.uint8))
+    return *found, gradient
+
+
 def adam():
     parameter, first, second = floats(4, 3), torch.zeros_like(floats(4, 3)), torch.zeros_like(floats(4, 3))
     ops.sparse_adam_(parameter, first, second, floats(4, 3), None, 1, lr=0.1)
@@ -113,6 +118,7 @@ RESULTS = {
     ),
     "project": lambda: ops.project(*list(gaussians().values())[:3], CAMERA),
     "photometric_loss": loss,
+    "photometric_loss_vjp": loss_vjp,
     "sparse_adam_": adam,
     "render": drawn,
     "count_visibility": lambda: (vdgs.count_visibility(floats(30, 3), [CAMERA]),),

@@ -208,7 +208,7 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     assert lines["on cpu: cpu"].value == f"all {len(operations.OPERATION_NAMES)} operations"
     assert lines["on cuda: cuda"].value == (
         "adam_tensors, add_view_statistics, count_visibility, cull, decode, decode_backward_adam, "
-        "decode_for_training, mark_visible, photometric_loss, splat_contributions"
+        "decode_for_training, mark_visible, photometric_loss, photometric_loss_vjp, splat_contributions"
     )
     assert lines["on cuda: cuda or gsplat"].value == "rasterize, rasterize_vjp"
     assert "adam_rows" in lines["on cuda: torch_ref"].value

@@ -159,6 +159,15 @@ class TestMeaning:
         loss.backward()
         torch.testing.assert_close(leaf.grad, 4 * once)
 
+    @pytest.mark.parametrize("kept", [None, 0.7])
+    def test_without_autograd_it_is_the_same_to_the_bit(self, implementation, kept):
+        image, target, mask = scene(23, 17, kept=kept)
+        expected, gradient = with_gradient(implementation, image, target, mask, ssim_weight=0.3)
+        found, same_gradient = implementation.photometric_loss_vjp(image, target, mask, ssim_weight=0.3)
+        assert all(torch.equal(one.detach(), other) for one, other in zip(expected, found, strict=True))
+        assert torch.equal(gradient, same_gradient)
+        assert not any(value.requires_grad for value in (*found, same_gradient))
+
     def test_only_the_loss_carries_a_gradient(self, implementation):
         image, target, _ = scene(8, 8)
         result = implementation.photometric_loss(image.requires_grad_(), target)

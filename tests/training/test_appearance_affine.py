@@ -32,7 +32,14 @@ from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.exposure import MAX_FLIGHT_GAP, apply_exposure, exposure_matrix, interpolate_exposure, zero_exposures
+from vdgs.model.exposure import (
+    MAX_FLIGHT_GAP,
+    apply_exposure,
+    apply_exposure_backward,
+    exposure_matrix,
+    interpolate_exposure,
+    zero_exposures,
+)
 from vdgs.model.renderer import render
 from vdgs.training import TrainingProblem, from_checkpoint, initial_state, to_checkpoint, train_step
 from vdgs.training.exposure_centering import center_exposures, count_exposure, zero_moments
@@ -70,6 +77,17 @@ def test_no_map_of_neutral_colors_is_nearer_to_all_photographs(seed, images, mas
     colors = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2).flatten(0, 1)
     best = torch.linalg.lstsq(colors, shown.flatten(0, 1)).solution.T
     assert torch.allclose(best, NEUTRAL, atol=1e-4)
+
+
+def test_the_way_back_of_an_exposure_is_that_of_autograd():
+    generator = torch.Generator().manual_seed(3)
+    picture = torch.rand(9, 14, 3, generator=generator).double().requires_grad_()
+    exposure = (torch.eye(3, 4) + 0.2 * torch.randn(3, 4, generator=generator)).double().requires_grad_()
+    gradient = torch.randn(9, 14, 3, generator=generator).double()
+    expected = torch.autograd.grad(apply_exposure(picture, exposure), (picture, exposure), gradient)
+    found = apply_exposure_backward(picture.detach(), exposure.detach(), gradient)
+    assert torch.allclose(found[0], expected[0])
+    assert torch.allclose(found[1], expected[1])
 
 
 def test_where_nothing_is_counted_no_exposure_moves():

@@ -88,6 +88,10 @@ class KernelBackend(Protocol):
         self, image: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = 0.2
     ) -> PhotometricLoss: ...
 
+    def photometric_loss_vjp(
+        self, image: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = 0.2
+    ) -> tuple[PhotometricLoss, Tensor]: ...
+
     def adam_rows(
         self, state: AdamState, rows: Tensor | None, gradient: Tensor, step: int | Tensor, *, beta1: float = 0.9,
         beta2: float = 0.999, epsilon: float = 1e-15,
@@ -156,6 +160,7 @@ GPU_BACKENDS: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATION_NAMES, ("torc
     "decode_for_training": ("cuda",),
     "mark_visible": ("cuda",),
     "photometric_loss": ("cuda",),
+    "photometric_loss_vjp": ("cuda",),
     "rasterize": ("cuda", "gsplat"),
     "rasterize_vjp": ("cuda", "gsplat"),
     "splat_contributions": ("cuda",),

@@ -72,5 +72,13 @@ def apply_exposure(image: Float[Tensor, "h w 3"], exposure: Float[Tensor, "3 4"]
     return image @ exposure[:, :3].T + exposure[:, 3]
 
 
+def apply_exposure_backward(
+    image: Float[Tensor, "h w 3"], exposure: Float[Tensor, "3 4"], gradient: Float[Tensor, "h w 3"]
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "3 4"]]:
+    """Gradients of a loss by what `apply_exposure` was given, from that by what it made."""
+    matrix = gradient.flatten(0, 1).T @ image.flatten(0, 1)
+    return gradient @ exposure[:, :3], torch.cat([matrix, gradient.sum((0, 1))[:, None]], dim=1)
+
+
 def _neutral(departures: Float[Tensor, "images 3 4"]) -> Float[Tensor, "3 4"]:
     return torch.eye(3, 4, dtype=departures.dtype, device=departures.device)

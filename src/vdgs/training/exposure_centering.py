@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.transfer import is_host
@@ -69,9 +70,9 @@ def count_exposure(
 
 def _mean_of_products(image: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"]) -> Float[Tensor, "4 4"]:
     """The mean of x xᵀ over the pixels that count; 0 where none does."""
-    pixels = image.double()
-    colors = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2) * counted[..., None]
-    return _sum_of_products(colors.flatten(0, 1)) / counted.sum().clamp(min=1)
+    colors = pad(image.double(), (0, 1), value=1.0).mul_(counted[..., None])
+    products = _sum_of_products(colors.flatten(0, 1))
+    return products / products[3, 3].clamp(min=1)  # of ones: how many pixels count
 
 
 def _sum_of_products(colors: Float[Tensor, "p 4"]) -> Float[Tensor, "4 4"]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
@@ -30,7 +31,7 @@ from vdgs.kernels.kernel_types import (
 )
 from vdgs.model.anchors import TRAINED_TENSORS, Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.exposure import apply_exposure
+from vdgs.model.exposure import apply_exposure, apply_exposure_backward
 from vdgs.training.depth_agreement import DepthAgreement
 from vdgs.training.target import TrainingTarget
 
@@ -63,7 +64,7 @@ class RenderedTrainingView:
         g = self.pullback(image, alpha, depth, out=self.scratch, count=m)
         # In float32, as autograd divides.
         opacities = g.opacities if self.opacity_factors is None else g.opacities * self.opacity_factors
-        volume = float(torch.tensor(volume_weight, dtype=torch.float32) / m) if m else 0.0
+        volume = float(np.float32(volume_weight) / np.float32(m)) if m else 0.0
         return SplatGradients(
             means_px=g.means_px, conics=g.conics, colors=g.colors, opacities=opacities,
             volume=volume, source=self.source, color_values=self.colors, opacity_values=self.opacities,
@@ -103,6 +104,7 @@ class LossGradients:
     image: Float[Tensor, "h w 3"]
 
 
+@torch.no_grad()
 def compute_loss(
     rendered: RenderedTrainingView,
     target: TrainingTarget,
@@ -114,21 +116,20 @@ def compute_loss(
     """Compare an image with its photograph, training image `image_index` of the capture. The gradient of a fitted
     exposure is left in the decoder's `.grad`. Gradients are scaled to the whole photograph (`valid_fraction`) and by
     `weight`, the loss is not."""
-    image = rendered.image.requires_grad_(True)
-    exposure = decoder.exposure_for_image(image_index)
+    image, exposure = rendered.image, decoder.exposure_for_image(image_index)
     shown = image if exposure is None else apply_exposure(image, exposure)
-    kernels = get_backend(image.device)
-    photometric = kernels.photometric_loss(shown, target.image, target.mask, ssim_weight=config.loss.ssim_lambda)
-    loss = photometric.loss.detach()
-    fitted = [decoder.exposure] if decoder.exposure is not None and decoder.exposure.requires_grad else []
-    found = torch.autograd.grad(photometric.loss, [image, *fitted])
-    for tensor, gradient in zip(fitted, found[1:], strict=True):
-        tensor.grad = gradient
+    (loss, l1, ssim), gradient = get_backend(image.device).photometric_loss_vjp(
+        shown, target.image, target.mask, ssim_weight=config.loss.ssim_lambda
+    )
     scale = target.valid_fraction * weight
+    if exposure is not None and decoder.exposure is not None:
+        gradient, of_exposure = apply_exposure_backward(image, exposure, gradient)
+        if decoder.exposure.requires_grad:
+            decoder.exposure.grad = torch.zeros_like(decoder.exposure)
+            decoder.exposure.grad[image_index] = of_exposure.mul_(scale)
     if scale != 1.0:
-        for each in found:
-            each.mul_(scale)
-    return LossGradients(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])
+        gradient.mul_(scale)
+    return LossGradients(loss=loss, l1=l1, ssim=ssim, shown=shown, image=gradient)
 
 
 def backward_and_step(

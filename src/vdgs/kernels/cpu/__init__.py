@@ -16,6 +16,7 @@ from vdgs.kernels.cpu.ellipsoids import mean_ellipsoids as mean_ellipsoids
 from vdgs.kernels.cpu.harmonics import fit_harmonics as fit_harmonics
 from vdgs.kernels.cpu.harmonics import harmonic_colors as harmonic_colors
 from vdgs.kernels.cpu.loss import photometric_loss as photometric_loss
+from vdgs.kernels.cpu.loss import photometric_loss_vjp as photometric_loss_vjp
 from vdgs.kernels.cpu.merged_splats import merged_splats as merged_splats
 from vdgs.kernels.cpu.project import project as project
 from vdgs.kernels.cpu.rasterize import rasterize as rasterize

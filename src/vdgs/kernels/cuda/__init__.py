@@ -9,6 +9,7 @@ from vdgs.kernels.cuda.decode import decode as decode
 from vdgs.kernels.cuda.decode import decode_for_training as decode_for_training
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam as decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss as photometric_loss
+from vdgs.kernels.cuda.loss import photometric_loss_vjp as photometric_loss_vjp
 from vdgs.kernels.cuda.rasterize import rasterize as rasterize
 from vdgs.kernels.cuda.rasterize import rasterize_vjp as rasterize_vjp
 from vdgs.kernels.cuda.rasterize import splat_contributions as splat_contributions

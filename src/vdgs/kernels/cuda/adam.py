@@ -42,14 +42,16 @@ def adam_tensors(
     it. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run."""
     if not states:
         return True
-    rates, roots = [], [1.0]
+    rates, root, known = [], 1.0, dict[tuple[float, float], float]()
     for state, gradient in zip(states, gradients, strict=True):
-        check_rows(state, None, gradient)
-        if gradient.dtype != torch.float32:
+        if not _fit(state, gradient):
+            check_rows(state, None, gradient)
             raise TypeError(f"parameter must be float32, not {gradient.dtype}")
-        factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
-        rates.append(float(factors.step_sizes[0]))
-        roots = [float(root) for root in factors.bias_roots]
+        rate = state.learning_rate, state.lr_boost
+        if rate not in known:  # some tensors share one
+            factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
+            known[rate], root = float(factors.step_sizes[0]), float(factors.bias_roots[0])
+        rates.append(known[rate])
     packed = [gradient.contiguous() for gradient in gradients]
     finite = packed[0].new_empty(len(states), dtype=torch.bool)
     moved = [tensor for state in states for tensor in state[:3]]
@@ -57,10 +59,16 @@ def adam_tensors(
     for first in range(0, len(states), MAX_TENSORS):
         some = slice(first, first + MAX_TENSORS)
         table = _table(states[some], packed[some], rates[some])
-        settings = (ctypes.c_float(value) for value in (roots[0], beta1, beta2, 1 - beta1, 1 - beta2, epsilon))
+        settings = (ctypes.c_float(value) for value in (root, beta1, beta2, 1 - beta1, 1 - beta2, epsilon))
         program.launch("adam_tensors", (len(states[some]),), (THREADS,), table, *settings, finite[some])
     torch.autograd.graph.increment_version(moved)
     return finite.all()
+
+
+def _fit(state: AdamState, gradient: Tensor) -> bool:
+    """Whether the tensors are of float32 and one shape; quicker than to say what is wrong."""
+    shape, tensors = gradient.shape, (*state[:3], gradient)
+    return bool(shape) and all(t.shape == shape and t.dtype == torch.float32 for t in tensors)
 
 
 def _table(states: Sequence[AdamState], gradients: Sequence[Tensor], rates: Sequence[float]) -> _Tensors:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Sequence
+from functools import cache
 from weakref import WeakKeyDictionary
 
 import torch
@@ -175,9 +177,30 @@ def pack_decoder(weights: DecoderWeights, k: int) -> list[tuple[Tensor, ...]]:
     key = (k, *(0 if tensor.is_inference() else tensor._version for tensor in weights.tensors()))
     known, packed = _packed.get(weights, ((), []))
     if known != key:
-        packed = [pack_head(head, k) for head in (weights.opacity, weights.covariance, weights.color)]
+        packed = _pack(weights, k)
         _packed[weights] = key, packed
     return packed
+
+
+def _pack(weights: DecoderWeights, k: int) -> list[tuple[Tensor, ...]]:
+    """`pack_head` of each head by one gather: its dozen copies would be a dozen launches."""
+    tensors = [tensor.detach() for tensor in weights.tensors()]
+    order, shapes = _packing(k, weights.opacity.w1.shape[1], tensors[0].device)
+    gathered = torch.cat([tensor.reshape(-1) for tensor in tensors]).index_select(0, order)
+    made = [part.view(shape) for part, shape in zip(gathered.split([*map(math.prod, shapes)]), shapes, strict=True)]
+    return [tuple(made[head : head + 4]) for head in range(0, len(made), 4)]
+
+
+@cache
+def _packing(k: int, inputs: int, device: torch.device) -> tuple[Int64[Tensor, " w"], tuple[tuple[int, ...], ...]]:
+    """Which number of a decoder's tensors, one after the other, is which number of the packed ones; their shapes."""
+    hidden = (HIDDEN_SIZE, inputs), (HIDDEN_SIZE,)
+    sizes = [size for c in (1, 7, 3) for size in (*hidden, (c * k, HIDDEN_SIZE), (c * k,))]
+    places = torch.arange(sum(map(math.prod, sizes)), dtype=torch.float64).split([*map(math.prod, sizes)])
+    named = [part.view(size) for part, size in zip(places, sizes, strict=True)]
+    heads = [MlpWeights(*named[first : first + 4]) for first in range(0, len(named), 4)]
+    packed = [tensor for head in heads for tensor in pack_head(head, k)]
+    return torch.cat([tensor.flatten() for tensor in packed]).long().to(device), tuple(tuple(t.shape) for t in packed)
 
 
 def pack_head(head: MlpWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -49,7 +49,7 @@ def decode_backward_adam(
         raise ValueError("features, offsets and log-scales must be annealed alike")
     v, device, source = len(rows), positions.device, gradients.source
     shown = source if isinstance(source, SplatMask) else SplatMask.of(source, v, k)
-    lacking, roots = (table.float() for table in bias_correction_tables(0.9, 0.999, device))
+    lacking, roots = bias_correction_tables(0.9, 0.999, device, torch.float32)
     broken = torch.zeros(1, dtype=torch.int32, device=device)
     before: list[KernelArgument] = [
         positions.contiguous(), *parts, *(ctypes.c_float(state.learning_rate) for state in moved),

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import NoReturn
 from weakref import WeakKeyDictionary
 
 import torch
@@ -86,13 +87,16 @@ class CudaProgram:
         if 0 in blocks:
             return
         function = self._function(driver, device, kernel)
-        values, pointers = pack_arguments(arguments)
+        data, pointers = pack_arguments(arguments)
         driver.launch(function, blocks, threads, device, pointers)
-        del values  # the driver has copied them; until then the pointers lead there
+        del data  # the driver has copied it; until then the pointers lead there
 
     def _function(self, driver: Driver, device: torch.device, kernel: str) -> int:
+        key = (device, kernel)
+        known = self._functions.get(key)
+        if known is not None:
+            return known
         with self._lock:
-            key = (device, kernel)
             if key not in self._functions:
                 if device not in self._modules:
                     target = get_nvrtc().target_for(driver.capability(device))
@@ -136,11 +140,21 @@ _packed_cameras: WeakKeyDictionary[Camera, PackedCamera] = WeakKeyDictionary()
 
 def pack_arguments(
     arguments: Sequence[KernelArgument],
-) -> tuple[list[ctypes._SimpleCData | ctypes.Structure], ctypes.Array[ctypes.c_void_p]]:
-    """What a launch is given: the values, which must outlive the call, and an array of pointers to them."""
-    values = [_value(argument) for argument in arguments]
-    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
-    return values, pointers
+) -> tuple[ctypes.Array[ctypes.c_void_p], ctypes.Array[ctypes.c_void_p]]:
+    """What a launch is given: addresses of data, which must outlive the call as the other arguments must, and an array
+    of pointers to addresses and arguments. (An array and not an object for each: a step launches some twenty kernels of
+    some twenty arguments, and is made to wait by nothing else on a small scene.)"""
+    count = len(arguments)
+    data, pointers = (ctypes.c_void_p * count)(), (ctypes.c_void_p * count)()
+    first, size = ctypes.addressof(data), ctypes.sizeof(ctypes.c_void_p)
+    for i, argument in enumerate(arguments):
+        if argument is None:
+            pointers[i] = first + i * size
+        elif isinstance(argument, Tensor):
+            data[i], pointers[i] = argument.data_ptr(), first + i * size
+        else:
+            pointers[i] = ctypes.addressof(argument)
+    return data, pointers
 
 
 def common_device(arguments: Sequence[KernelArgument], device_type: str) -> torch.device:
@@ -148,6 +162,14 @@ def common_device(arguments: Sequence[KernelArgument], device_type: str) -> torc
     tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
     if not tensors:
         raise ValueError("a kernel must be given at least one tensor")
+    device = tensors[0].device
+    if device.type != device_type or not all(t.device == device and t.is_contiguous() for t in tensors):
+        _refuse(tensors, device_type)
+    return device
+
+
+def _refuse(tensors: Sequence[Tensor], device_type: str) -> NoReturn:
+    """Say what is wrong with the tensors of a kernel."""
     devices = {tensor.device for tensor in tensors}
     for device in devices:
         if device.type != device_type:
@@ -155,17 +177,7 @@ def common_device(arguments: Sequence[KernelArgument], device_type: str) -> torc
     for tensor in tensors:
         if not tensor.is_contiguous():
             raise ValueError(f"a kernel's tensors must be contiguous; one of shape {list(tensor.shape)} is not")
-    if len(devices) > 1:
-        raise ValueError(f"a kernel's tensors are on several devices: {', '.join(sorted(map(str, devices)))}")
-    return devices.pop()
-
-
-def _value(argument: KernelArgument) -> ctypes._SimpleCData | ctypes.Structure:
-    if argument is None:
-        return ctypes.c_void_p(0)
-    if isinstance(argument, Tensor):
-        return ctypes.c_void_p(argument.data_ptr())
-    return argument
+    raise ValueError(f"a kernel's tensors are on several devices: {', '.join(sorted(map(str, devices)))}")
 
 
 def _sides(sides: Sequence[int]) -> GridSize:

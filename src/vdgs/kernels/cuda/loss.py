@@ -29,10 +29,34 @@ def photometric_loss(
     """As `torch_ref.photometric_loss`, for float32 images on a CUDA device, without waiting for it. Differentiable
     once, deterministic. The gradient is computed with the loss and takes 36 bytes a pixel until then. Raises TypeError
     for tensors elsewhere, ValueError for several devices, CudaUnavailable where the kernel cannot be run."""
+    _check(image, target, mask)
+    return PhotometricLoss(*_Photometric.apply(image, target, mask, ssim_weight, program))
+
+
+def photometric_loss_vjp(
+    image: Float[Tensor, "h w 3"],
+    target: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"] | None = None,
+    *,
+    ssim_weight: float = 0.2,
+    program: CudaProgram = PROGRAM,
+) -> tuple[PhotometricLoss, Float[Tensor, "h w 3"]]:
+    """As `torch_ref.photometric_loss_vjp`; waits, bits and errors are those of `photometric_loss`. (Autograd goes
+    backward in a thread of its own: on a card that takes longer than the kernels.)"""
+    _check(image, target, mask)
+    *values, gradient = _run(_pictures(image, target, mask), ssim_weight, True, program)
+    assert gradient is not None
+    return PhotometricLoss(*values), gradient
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
     check_images(image, target, mask)
     if image.dtype != torch.float32:
         raise TypeError(f"image must be float32, not {image.dtype}")
-    return PhotometricLoss(*_Photometric.apply(image, target, mask, ssim_weight, program))
+
+
+def _pictures(*tensors: Tensor | None) -> list[Tensor | None]:
+    return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors]
 
 
 class _Photometric(torch.autograd.Function):
@@ -40,8 +64,8 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, program: CudaProgram
     ) -> tuple[Tensor, ...]:
-        pictures = [None if t is None else t.detach().contiguous() for t in (image, target, mask)]
-        loss, l1, ssim, ctx.gradient = _run(pictures, ssim_weight, ctx.needs_input_grad[0], program)
+        pictures, with_gradient = _pictures(image, target, mask), ctx.needs_input_grad[0]
+        loss, l1, ssim, ctx.gradient = _run(pictures, ssim_weight, with_gradient, program)
         ctx.mark_non_differentiable(l1, ssim)
         ctx.set_materialize_grads(False)
         return loss, l1, ssim

@@ -174,7 +174,7 @@ class _Pullback:
         )  # fmt: skip
         by_background = torch.zeros_like(self.background)
         if wanted[0] is not None:
-            by_background = (self.transmittance[..., None] * wanted[0]).sum((0, 1))
+            by_background = self.transmittance.view(-1) @ wanted[0].view(-1, 3)
         return RasterGradients(by_means, by_conics, by_colors, by_opacities, by_depths, by_background)
 
 

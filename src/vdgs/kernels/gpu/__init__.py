@@ -12,6 +12,7 @@ from vdgs.kernels.cuda import decode_backward_adam as decode_backward_adam
 from vdgs.kernels.cuda import decode_for_training as decode_for_training
 from vdgs.kernels.cuda import mark_visible as mark_visible
 from vdgs.kernels.cuda import photometric_loss as photometric_loss
+from vdgs.kernels.cuda import photometric_loss_vjp as photometric_loss_vjp
 from vdgs.kernels.cuda import splat_contributions as splat_contributions
 from vdgs.kernels.gpu.rasterizer import rasterize as rasterize
 from vdgs.kernels.gpu.rasterizer import rasterize_vjp as rasterize_vjp

@@ -16,6 +16,7 @@ from vdgs.kernels.torch_ref.ellipsoids import mean_ellipsoids as mean_ellipsoids
 from vdgs.kernels.torch_ref.harmonics import fit_harmonics as fit_harmonics
 from vdgs.kernels.torch_ref.harmonics import harmonic_colors as harmonic_colors
 from vdgs.kernels.torch_ref.loss import photometric_loss as photometric_loss
+from vdgs.kernels.torch_ref.loss import photometric_loss_vjp as photometric_loss_vjp
 from vdgs.kernels.torch_ref.merged_splats import merged_splats as merged_splats
 from vdgs.kernels.torch_ref.project import project as project
 from vdgs.kernels.torch_ref.rasterize import rasterize as rasterize

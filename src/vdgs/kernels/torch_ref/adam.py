@@ -104,10 +104,12 @@ def _of_rows(
 
 
 @cache
-def bias_correction_tables(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor, Tensor]:
-    """1 - beta1^u and 1 / sqrt(1 - beta2^u) for u = 1, 2, ... updates, in float64."""
+def bias_correction_tables(
+    beta1: float, beta2: float, device: torch.device, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor]:
+    """1 - beta1^u and 1 / sqrt(1 - beta2^u) for u = 1, 2, ... updates."""
     first, second = _lacking(beta1, beta2)
-    return torch.from_numpy(first).to(device), torch.from_numpy(1 / np.sqrt(second)).to(device)
+    return torch.from_numpy(first).to(device, dtype), torch.from_numpy(1 / np.sqrt(second)).to(device, dtype)
 
 
 def check_step(

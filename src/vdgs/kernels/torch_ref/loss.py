@@ -51,6 +51,21 @@ def photometric_loss(
     return PhotometricLoss(loss, l1.detach(), 1 - dissimilarity.detach())
 
 
+def photometric_loss_vjp(
+    image: Float[Tensor, "h w 3"],
+    target: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"] | None = None,
+    *,
+    ssim_weight: float = 0.2,
+) -> tuple[PhotometricLoss, Float[Tensor, "h w 3"]]:
+    """`photometric_loss` without autograd around it: its values, and its gradient by the image. Errors as there."""
+    with torch.enable_grad():
+        leaf = image.detach().requires_grad_(True)
+        found = photometric_loss(leaf, target, mask, ssim_weight=ssim_weight)
+        (gradient,) = torch.autograd.grad(found.loss, leaf)
+    return found._replace(loss=found.loss.detach()), gradient
+
+
 def ssim_map(
     image: Float[Tensor, "h w c"] | UInt8[Tensor, "h w c"], target: Float[Tensor, "h w c"] | UInt8[Tensor, "h w c"]
 ) -> Float[Tensor, "h w c"]:
