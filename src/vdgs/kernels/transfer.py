@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+#: Share of what a card has free that `DeviceCopies` may take.
+COPIES_SHARE = 0.1
 
 
 def to_like(values: Any, like: Tensor) -> Tensor:
@@ -20,6 +25,32 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type != "cuda" or tensor.device.type != "cpu":
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+class DeviceCopies:
+    """Copies on a card of large tensors of main memory that are asked for again and again, such as photographs. A copy
+    is kept as long as its original is there, while all of them take at most a share of what the card has free when the
+    first one comes. They hold what the originals held then: these must not change."""
+
+    def __init__(self) -> None:
+        self._kept: MutableMapping[Tensor, Tensor] = WeakIdKeyDictionary()
+        self._room: int | None = None
+
+    def part(self, tensor: Tensor, inside: tuple[slice, ...], device: torch.device) -> Tensor:
+        """`tensor[inside]` on a device."""
+        whole = self._whole(tensor, device) if device.type == "cuda" else None
+        return upload(tensor[inside], device) if whole is None else whole[inside]
+
+    def _whole(self, tensor: Tensor, device: torch.device) -> Tensor | None:
+        """The copy of all of it; None where there is no room."""
+        if (kept := self._kept.get(tensor)) is not None:
+            return kept
+        if self._room is None:
+            self._room = int(COPIES_SHARE * torch.cuda.mem_get_info(device)[0])
+        if tensor.nbytes + sum(copy.nbytes for copy in self._kept.values()) > self._room:
+            return None
+        self._kept[tensor] = upload(tensor, device)
+        return self._kept[tensor]
 
 
 def is_host(tensor: Tensor) -> bool:

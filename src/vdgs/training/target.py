@@ -90,9 +90,11 @@ def make_target(stage: TrainingProblem, view: int, downscale: int, box: PixelBox
     of_whole = count_valid_pixels(mask, whole)
     mask = None if mask is None else mask[inside]
     share = 1.0 if camera is whole else count_valid_pixels(mask, camera) / max(of_whole, 1)
-    image = upload(image[inside], stage.device)
     return TrainingTarget(
-        image=image, mask=None if mask is None else upload(mask, stage.device), camera=camera, valid_fraction=share
+        image=stage.copies.part(image, inside, stage.device),
+        mask=None if mask is None else upload(mask, stage.device),
+        camera=camera,
+        valid_fraction=share,
     )
 
 

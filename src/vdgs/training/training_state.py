@@ -14,6 +14,7 @@ from torch import Tensor
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import DensificationStats
+from vdgs.kernels.transfer import DeviceCopies
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import EXPOSURE, OLD_EXPOSURE, Decoder
@@ -185,6 +186,8 @@ class TrainingProblem:
     skylines: Sequence[Tensor | None] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    #: Of photographs, on that device.
+    copies: DeviceCopies = field(default_factory=DeviceCopies)
 
     @property
     def loss_weight(self) -> float:
