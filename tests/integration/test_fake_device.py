@@ -23,6 +23,7 @@ from vdgs.training import (
     TrainingProblem,
     TrainingState,
     initial_state,
+    pseudo_views,
     to_checkpoint,
     train_step,
     training_loop,
@@ -130,6 +131,28 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasterizer):
             "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 2,
         }
         assert dict(waits) == WAITS | tiles | surroundings
+
+
+@pytest.mark.parametrize("rasterizer", ["cuda"], indirect=True)
+def test_a_pseudo_view_asks_for_its_place_and_its_share_besides(monkeypatch, rasterizer):
+    # A fresh model hides nothing, and so shows no place.
+    monkeypatch.setattr(training_loop, "pseudo_camera", lambda *given: pseudo_views.pseudo_camera(*given) or given[0])
+    monkeypatch.setattr(pseudo_views, "MIN_SHARE", -1.0)
+    loss = replace(CONFIG.loss, depth_agreement=0.05, pseudo_views=0.3)
+    with pretended_card() as waits:
+        state, stage = begun(CARD, loss=loss, iterations=60)
+        state.iteration = 20
+        train_step(state, stage)
+        state.iteration = 24
+        waits.clear()
+        train_step(state, stage)
+    assert dict(waits) == WAITS | {
+        "kernels/cuda/rasterize.py: _entries: _local_scalar_dense": 2,
+        "kernels/cuda/cull.py: cull: _local_scalar_dense": 4,
+        "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 4,
+        "training/pseudo_views.py: pseudo_camera: tolist": 1,
+        "training/pseudo_views.py: warp_photograph: _local_scalar_dense": 1,
+    }
 
 
 @pytest.mark.parametrize("rasterizer", ["cuda"], indirect=True)

@@ -13,6 +13,7 @@ from vdgs.kernels.cuda import launch, loss
 from vdgs.kernels.cuda.adam import PROGRAM as ADAM
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
+from vdgs.kernels.cuda.decode import packing_order
 from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERIZE
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.cuda.visibility import PROGRAM as VISIBILITY
@@ -39,4 +40,5 @@ def install(drivers: dict[str, HostDriver], monkeypatch: pytest.MonkeyPatch, dev
     fake_gsplat.install(monkeypatch)
     monkeypatch.setenv(choosing.RASTERIZER_ENV_VAR, rasterizer)
     choosing.select_rasterizer.cache_clear()
-    adam.bias_correction_tables.cache_clear()
+    for kept_on_a_card in (adam.bias_correction_tables, packing_order):
+        kept_on_a_card.cache_clear()

@@ -185,14 +185,14 @@ def pack_decoder(weights: DecoderWeights, k: int) -> list[tuple[Tensor, ...]]:
 def _pack(weights: DecoderWeights, k: int) -> list[tuple[Tensor, ...]]:
     """`pack_head` of each head by one gather: its dozen copies would be a dozen launches."""
     tensors = [tensor.detach() for tensor in weights.tensors()]
-    order, shapes = _packing(k, weights.opacity.w1.shape[1], tensors[0].device)
+    order, shapes = packing_order(k, weights.opacity.w1.shape[1], tensors[0].device)
     gathered = torch.cat([tensor.reshape(-1) for tensor in tensors]).index_select(0, order)
     made = [part.view(shape) for part, shape in zip(gathered.split([*map(math.prod, shapes)]), shapes, strict=True)]
     return [tuple(made[head : head + 4]) for head in range(0, len(made), 4)]
 
 
 @cache
-def _packing(k: int, inputs: int, device: torch.device) -> tuple[Int64[Tensor, " w"], tuple[tuple[int, ...], ...]]:
+def packing_order(k: int, inputs: int, device: torch.device) -> tuple[Int64[Tensor, " w"], tuple[tuple[int, ...], ...]]:
     """Which number of a decoder's tensors, one after the other, is which number of the packed ones; their shapes."""
     hidden = (HIDDEN_SIZE, inputs), (HIDDEN_SIZE,)
     sizes = [size for c in (1, 7, 3) for size in (*hidden, (c * k, HIDDEN_SIZE), (c * k,))]

@@ -80,12 +80,12 @@ __device__ float clamped(float a, float low, float high) { return fminf(fmaxf(a,
 // Alpha before it is clamped. The card's own exponential is off by 1e-6 at most, for the q that reach here.
 __device__ float alpha_of(const Shape& s, float q) { return s.opacity * __expf(-0.5f * q); }
 
-// Whether a splat may reach a pixel's center of a tile, or of another square of `side` pixels in a grid of such: the least
-// q over the rectangle of centers lies at the mean or on the border. The rectangle is widened a little, for rounding.
-__device__ bool touches(const Shape& s, int column, int row, int side = kTile) {
+// Whether a splat may reach a pixel's center of a tile: the least q over the rectangle of centers lies at the mean or on
+// the border. The rectangle is widened a little, for rounding.
+__device__ bool touches(const Shape& s, int column, int row) {
   const float slack = 0.01f;
-  const float left = static_cast<float>(column * side) + 0.5f - s.x - slack, right = left + (side - 1) + 2 * slack;
-  const float top = static_cast<float>(row * side) + 0.5f - s.y - slack, bottom = top + (side - 1) + 2 * slack;
+  const float left = static_cast<float>(column * kTile) + 0.5f - s.x - slack, right = left + (kTile - 1) + 2 * slack;
+  const float top = static_cast<float>(row * kTile) + 0.5f - s.y - slack, bottom = top + (kTile - 1) + 2 * slack;
   if (left <= 0.0f && right >= 0.0f && top <= 0.0f && bottom >= 0.0f) return true;
   const float tilt = -s.ux * s.uy / square_of(s.uy, s.vy), lean = -s.uy / s.ux;
   const float nearest = fminf(fminf(quadratic(s, left, clamped(tilt * left, top, bottom)),
@@ -293,7 +293,6 @@ rasterize_backward(const float* means, const float* conics, const float* colors,
                    const float* by_image, const float* by_alpha, const float* by_depth, long long kept, float* sums) {
   __shared__ Entry batch[kBatch];
   __shared__ bool keeps[kBatch];  // whether the sums of an entry are wanted
-  __shared__ unsigned char reached[kBatch];  // the warps whose pixels an entry may reach, a bit each
   __shared__ long long slots[kBatch];
   __shared__ float parts[kBackWarps][kBatch][kSums];
   const Splats splats{means, conics, colors, opacities, depths};
@@ -330,23 +329,14 @@ rasterize_backward(const float* means, const float* conics, const float* colors,
       const int owner = owners[slots[threadIdx.x]];
       read_entry(splats, owner, batch[threadIdx.x]);
       keeps[threadIdx.x] = owner < kept;
-      unsigned warps = 0;
-#pragma unroll 1
-      for (int w = 0; w < kBackWarps; ++w) {
-        const int its_column = blockIdx.x * 2 + w % 2, its_row = blockIdx.y * 2 + w / 2;
-        warps |= static_cast<unsigned>(touches(batch[threadIdx.x].shape, its_column, its_row, kTile / 2)) << w;
-      }
-      reached[threadIdx.x] = static_cast<unsigned char>(warps);
     }
     __syncthreads();
     for (int i = 0; i < size; ++i) {
       float values[kRoom] = {};
       bool counts = false;
-      if (reached[i] >> warp & 1u) {  // the same for all lanes; most splats are smaller than a tile
 #pragma unroll
-        for (int p = 0; p < kPixels; ++p)
-          counts |= add_pixel(batch[i], x - batch[i].shape.x, begin + i < pixels[p].until, pixels[p], values);
-      }
+      for (int p = 0; p < kPixels; ++p)
+        counts |= add_pixel(batch[i], x - batch[i].shape.x, begin + i < pixels[p].until, pixels[p], values);
       if (!keeps[i]) continue;  // the same for all threads
       float sum = 0.0f;
       if (__any_sync(kAllLanes, counts)) sum = add_over_warp(values);
