@@ -75,8 +75,9 @@ def assign_splits(
     for side in ("train", "test"):
         if side not in {view.split for view in chosen}:
             raise CaptureError(
-                f"{root}: no photograph is left to {side} on ({len(views)} in all). Check --test-list, "
-                "--split and --max-images; at least two photographs are needed."
+                f"{root}: no photograph is left to {side} on ({len(views)} in all). Check --test-list and "
+                "--max-images, or keep every n-th for the test, whatever lists there are: --split every. At least two "
+                "photographs are needed."
             )
     return chosen
 
