@@ -92,7 +92,7 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
         if not seen.any():
             raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
-    views = assign_splits(root, views, explicit, options, warnings)
+    views = assign_splits(root, views, explicit, options, warnings, images=source.images)
     off_path = [_view(photo, options, ground, "test") for photo in match_off_path(root, options, warnings)]
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
