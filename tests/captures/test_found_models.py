@@ -252,7 +252,7 @@ def test_photographs_beside_a_capture_are_found_at_its_own_level(tmp_path, scene
 def test_captures_beside_the_one_that_is_named_are_said(tmp_path, scene):
     for side in ("train", "val"):
         write_colmap(tmp_path / side, scene)
-    with pytest.raises(CaptureError, match=r"train is a capture: .* --output RUN \(without the photographs of val,"):
+    with pytest.raises(CaptureError, match=r"train is a capture: .* --output RUN \(beside it: val;"):
         load_capture(tmp_path)
 
 
