@@ -399,6 +399,26 @@ def test_cameras_of_a_trained_scene_are_no_reconstruction(tmp_path):
         load_capture(file)
 
 
+@pytest.mark.parametrize("twice", [3, 12])
+def test_images_that_lie_in_two_folders_are_called_so(tmp_path, scene, twice):
+    """The model names them without folders. Both folders are there, and either may be given."""
+    write_colmap(tmp_path, scene)
+    (tmp_path / "images").rename(tmp_path / "left")
+    (tmp_path / "images/right").mkdir(parents=True)
+    (tmp_path / "left").rename(tmp_path / "images/left")
+    for name in sorted(scene.cameras)[:twice]:
+        shutil.copy(tmp_path / "images/left" / name, tmp_path / "images/right" / name)
+    said = (
+        rf"{twice} of the missing images are there several times, .*'frame_000\.png' may be (left|right)/frame_000\.png"
+    )
+    if twice == 3:
+        assert any(re.search(said, note) for note in load_capture(tmp_path).warnings)
+    else:
+        with pytest.raises(CaptureError, match=rf"12 of 12 images(?s:.*){said}"):
+            load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(images="images/left")).views) == 12
+
+
 def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path, scene):
     write_colmap(tmp_path, scene, text=True)
     file = tmp_path / "sparse/0/images.txt"
