@@ -129,7 +129,7 @@ def test_lists_beside_the_photographs_are_read_and_said(tmp_path, scene, name, i
     assert [view.name for view in capture.test_views] == names[3:5]
     assert names[5] not in {view.name for view in capture.views}
     assert f"{place / name} says which photographs are for the test." in capture.warnings
-    assert f"{place / 'validation.txt'} says which photographs are for the validation." in capture.warnings
+    assert f"{place / 'validation.txt'} says which photographs are for validation." in capture.warnings
     notes = list[str]()
     held_out = held_out_by_capture(root, where, names, options, notes)  # as `vdgs sfm` asks, which writes them down
     assert held_out == {"test.txt": set(names[3:5]), "validation.txt": {names[5]}}

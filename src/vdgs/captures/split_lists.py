@@ -30,13 +30,13 @@ def own_list(
     if not lists:
         return None
     used, *others = lists
-    what = "validation" if used.name == VALIDATION_LIST else "test"
+    what = "validation" if used.name == VALIDATION_LIST else "the test"
     if used.parent != root:
-        notes.append(f"{used} says which photographs are for the {what}.")
+        notes.append(f"{used} says which photographs are for {what}.")
     meant = _meant(used, photographs)
     for other in others:
         if _meant(other, photographs) != meant:
-            notes.append(f"{other} names other photographs for the {what} than {used}, and is not used. Keep one list.")
+            notes.append(f"{other} names other photographs for {what} than {used}, and is not used. Keep one list.")
     return used
 
 
