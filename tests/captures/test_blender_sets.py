@@ -12,6 +12,7 @@ from PIL import Image
 
 from support.captures import TinyScene, assert_sees_the_scene
 from support.dataset_layouts import halves, write_blender
+from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -102,6 +103,31 @@ def test_a_test_file_without_frames_is_none(tmp_path, both):
     (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": []}))
     with pytest.raises(CaptureError, match=r"transforms_train\.json: must hold a list 'frames'"):
         load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("gone", [1, 2, 3])
+def test_photographs_of_the_test_file_that_are_gone_are_replaced_by_no_others(tmp_path, both, gone):
+    """Where some are left, figures are of these, and a note says so; where none is, a person chooses what to test on,
+    also where points are still to be found."""
+    for image in sorted((tmp_path / "test").iterdir())[:gone]:
+        image.unlink()
+    if gone < 3:
+        capture = load_capture(tmp_path)
+        assert {view.name for view in capture.test_views} == {f"test/000{k}.png" for k in range(gone, 3)}
+        said = f"transforms_test.json: {gone} of its 3 test photographs are missing"
+        assert any(said in note for note in capture.warnings)
+        return
+    for needs_points in (True, False):
+        with pytest.raises(
+            CaptureError, match=r"transforms_test\.json: none of its 3 test photographs is there"
+        ) as said:
+            read_source(tmp_path, CaptureOptions(), needs_points=needs_points)
+    assert "test/0002.png" in str(said.value)
+    every = load_capture(tmp_path, CaptureOptions(split="every", test_every=3))
+    assert [view.name for view in every.test_views] == [f"train/000{k}.png" for k in (0, 3, 6)]
+    (tmp_path / "mine.txt").write_text("train/0004.png")
+    mine = load_capture(tmp_path, CaptureOptions(test_list=tmp_path / "mine.txt"))
+    assert [view.name for view in mine.test_views] == ["train/0004.png"]
 
 
 def test_without_test_file_the_validation_is_the_test(tmp_path, both):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from support.dataset_layouts import (
     write_mega_nerf,
 )
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
 # -------------------------------------------------------------------------------------------- Mega-NeRF
@@ -60,8 +62,9 @@ def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
     whole = file.read_bytes()
     for content in (whole[:100], b"", b"not torch at all", whole[:-60]):
         file.write_bytes(content)
-        with pytest.raises(CaptureError, match=r"000001\.pt: cannot be read as a torch file"):
+        with pytest.raises(CaptureError, match=r"000001\.pt: cannot be read as a torch file .*Copy it again") as said:
             load_capture(tmp_path)
+        assert "weights_only" not in str(said.value)  # torch advises to let code in the file run
     torch.save({"H": np.float64(48)}, file)
     with pytest.raises(CaptureError, match=r"000001\.pt: holds other things than tensors.* Save it anew") as refused:
         load_capture(tmp_path)
@@ -74,6 +77,36 @@ def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
     for image in gone:
         image.unlink()
     with pytest.raises(CaptureError, match=r"[67] of 12 images .* are missing(?s:.)*000002(?s:.)*UrbanScene3D"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("changed", ["nothing", "pose", "both"])
+def test_a_photograph_in_both_folders_of_mega_nerf_only_tests(tmp_path, scene, changed):
+    """It is the same by its pose or by its bytes; of another pose and content, its number means another photograph."""
+    write_mega_nerf(tmp_path, scene)
+    write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colors)
+    train, val = tmp_path / "train", tmp_path / "val"
+    pose = torch.load(train / "metadata/000001.pt", weights_only=True)["c2w"]
+    content = torch.load(val / "metadata/000000.pt", weights_only=True)
+    torch.save(content | ({} if changed == "nothing" else {"c2w": pose}), train / "metadata/000000.pt")
+    other = (train / "rgbs/000001.png") if changed == "both" else (val / "rgbs/000000.png")
+    shutil.copy(other, train / "rgbs/000000.png")
+    capture = load_capture(tmp_path)
+    notes = [note for note in capture.warnings if "train/000000.png: among the photographs for training and" in note]
+    assert (len(capture.train_views), len(capture.test_views)) == ((10, 3) if changed == "both" else (9, 3))
+    assert len(notes) == (changed != "both")
+
+
+def test_mega_nerf_without_its_test_photographs_is_refused(tmp_path, scene):
+    write_mega_nerf(tmp_path, scene)
+    write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colors)
+    for image in (tmp_path / "val/rgbs").iterdir():
+        image.unlink()
+    with pytest.raises(CaptureError, match=r"val: none of its 3 test photographs is there\.(?s:.*)val/rgbs/000005"):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(split="every")).test_views) == 2
+    shutil.rmtree(tmp_path / "val/metadata")
+    with pytest.raises(CaptureError, match=r"no photograph is left to test on .*--split every"):
         load_capture(tmp_path)
 
 
@@ -106,7 +139,10 @@ def test_matrixcity_pose_folder(tmp_path, scene):
     files[1].write_text(json.dumps(contents[1]))
     twice = load_capture(root)
     assert (len(twice.train_views), len(twice.test_views)) == (8, 4)
-    assert any("0008.png: in the training file and in the test file" in warning for warning in twice.warnings)
+    assert any(
+        "0008.png: among the photographs for training and among those for the test" in warning
+        for warning in twice.warnings
+    )
     for k in range(7):
         (tmp_path / "aerial" / "train" / "block_1" / f"000{k}.png").unlink()
     with pytest.raises(CaptureError, match=r"7 of 13 images .* are missing(?s:.)*0003\.png(?s:.)*Unpack the \.tar"):

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap, write_images
-from vdgs.captures.formats.colmap import read_colmap
+from vdgs.captures.formats.colmap import has_points, read_colmap
 from vdgs.captures.formats.source_capture import CAMERA_MODELS
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -223,6 +223,35 @@ def test_the_biggest_of_several_models_is_used(tmp_path):
     capture = load_capture(tmp_path, CaptureOptions(up="z"))
     assert len(capture.views) == len(whole.cameras)
     assert any("several sparse models" in warning for warning in capture.warnings)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_points_of_the_other_kind_are_read_where_there_are_no_others(tmp_path, text):
+    """As where someone converted a part of the model."""
+    scene, kinds = tiny_scene(), (".txt", ".bin") if text else (".bin", ".txt")
+    folder = write_colmap(tmp_path, scene, text=text)
+    other = write_colmap(tmp_path / "other", scene, images=None, text=not text)
+    (folder / f"points3D{kinds[0]}").unlink()
+    (other / f"points3D{kinds[1]}").rename(folder / f"points3D{kinds[1]}")
+    assert has_points(folder)
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert len(capture.points) == len(scene.points)
+    assert any(f"points3D{kinds[1]} is used; there is no points3D{kinds[0]}" in note for note in capture.warnings)
+    (folder / f"points3D{kinds[1]}").unlink()
+    assert not has_points(folder)
+
+
+def test_a_larger_model_without_a_number_is_named_with_what_uses_it(tmp_path):
+    whole = tiny_scene()
+    part = TinyScene(dict(list(whole.cameras.items())[:3]), whole.points[:50], whole.colors[:50])
+    write_colmap(tmp_path, part, images=None, sparse="sparse/0")
+    write_colmap(tmp_path, whole, sparse="sparse/geo")
+    write_colmap(tmp_path, part, images=None, sparse="sparse/old")
+    [note] = [note for note in load_capture(tmp_path, CaptureOptions(up="z")).warnings if "vdgs run" in note]
+    assert note.startswith("sparse/geo holds 12 images, and sparse/0, which is read, 3.")
+    command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", note)
+    assert command is not None
+    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2], up="z")).views) == 12
 
 
 @pytest.mark.capture

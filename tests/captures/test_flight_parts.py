@@ -34,7 +34,7 @@ def flight(obliques: int = 6) -> list[View]:
 def sides_of(views: list[View], **options: object) -> tuple[set[int], set[int]]:
     """The numbers of the photographs that test, and that train."""
     settings = CaptureOptions(**options)  # type: ignore[arg-type]
-    chosen = assign_splits(Path("flight"), views, dict.fromkeys([v.name for v in views]), settings, [])
+    chosen = assign_splits(Path("flight"), views, dict.fromkeys([v.name for v in views]), settings, [], images="images")
     sides: dict[str, set[int]] = {"test": set(), "train": set()}
     for each in chosen:
         sides[each.split].add(int(each.name[4:-4]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import struct
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ import pytest
 from support.captures import TinyScene, tiny_scene, write_colmap, write_images, write_ply
 from support.dataset_layouts import DRB, OPENGL, halves, write_blender, write_matrixcity, write_mega_nerf
 from vdgs.captures.format_dispatch import lacks_points
-from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
 from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import foreign_poses
 from vdgs.captures.output_guard import is_capture
@@ -254,7 +252,7 @@ def test_photographs_beside_a_capture_are_found_at_its_own_level(tmp_path, scene
 def test_captures_beside_the_one_that_is_named_are_said(tmp_path, scene):
     for side in ("train", "val"):
         write_colmap(tmp_path / side, scene)
-    with pytest.raises(CaptureError, match=r"train is a capture: .* --output RUN \(without the photographs of val,"):
+    with pytest.raises(CaptureError, match=r"train is a capture: .* --output RUN \(beside it: val;"):
         load_capture(tmp_path)
 
 
@@ -325,64 +323,6 @@ def test_numbers_that_are_whole_may_be_written_with_a_point(tmp_path, scene):
         load_capture(tmp_path / "colmap")
     write_transforms(tmp_path / "nerf", scene, w=64.0, h="48", fl_x="57.6")
     assert load_capture(tmp_path / "nerf").views[0].camera.height == 48
-
-
-# ---------------------------------------------------------------------------------------------- colors
-
-COLORS = np.random.default_rng(5).integers(0, 256, (50, 3))
-
-
-def cloud(file: Path, names: tuple[str, ...], kind: str, values: np.ndarray, form: str) -> Path:
-    codes = {"uchar": "B", "ushort": "H", "int": "i", "float": "f", "double": "d"}
-    header = f"ply\nformat {form} 1.0\nelement vertex {len(values)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz")
-    header += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
-    cast = float if kind in ("float", "double") else int
-    if form == "ascii":
-        body = "".join(f"1 2 3 {' '.join(str(cast(v)) for v in row)}\n" for row in values).encode()
-    else:
-        code = f"{'<' if 'little' in form else '>'}3f{values.shape[1]}{codes[kind]}"
-        body = b"".join(struct.pack(code, 1, 2, 3, *map(cast, row)) for row in values)
-    file.write_bytes(header.encode() + body)
-    return file
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
-        ("Red", "Green", "Blue"), ("alpha", "R", "G", "B"),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize(
-    ("kind", "factor"),
-    [
-        ("uchar", 1), ("ushort", 257), ("ushort", 1), ("int", 257), ("int", 1), ("float", 1 / 255), ("float", 1),
-        ("double", 257),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_colors_of_clouds_are_read_by_every_name_and_scale(tmp_path, names, kind, factor, form):
-    values = COLORS * factor
-    if len(names) == 4:
-        values = np.c_[values[:, :1], values]
-    points, found = read_point_cloud(cloud(tmp_path / "a.ply", names, kind, values, form))
-    assert (points == [1, 2, 3]).all()
-    assert np.abs(found.astype(int) - COLORS).max() <= 1
-
-
-def test_colors_of_splats_and_none_at_all(tmp_path):
-    coefficients = (COLORS / 255 - 0.5) / 0.28209479177387814
-    file = cloud(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), "float", coefficients, "binary_big_endian")
-    assert np.abs(read_point_cloud(file)[1].astype(int) - COLORS).max() <= 1
-    gray = cloud(tmp_path / "b.ply", ("u", "v"), "float", COLORS[:, :2], "binary_little_endian")
-    assert (read_point_cloud(gray)[1] == GRAY).all()
-
-
-def test_a_comment_ends_no_header(tmp_path):
-    file = cloud(tmp_path / "a.ply", ("red", "green", "blue"), "uchar", COLORS, "binary_big_endian")
-    file.write_bytes(file.read_bytes().replace(b"1.0\n", b"1.0\ncomment end_header is below\nobj_info 1\n", 1))
-    assert (read_point_cloud(file)[1] == COLORS).all()
 
 
 @pytest.mark.parametrize("last", [True, False])
@@ -459,6 +399,26 @@ def test_cameras_of_a_trained_scene_are_no_reconstruction(tmp_path):
         load_capture(file)
 
 
+@pytest.mark.parametrize("twice", [3, 12])
+def test_images_that_lie_in_two_folders_are_called_so(tmp_path, scene, twice):
+    """The model names them without folders. Both folders are there, and either may be given."""
+    write_colmap(tmp_path, scene)
+    (tmp_path / "images").rename(tmp_path / "left")
+    (tmp_path / "images/right").mkdir(parents=True)
+    (tmp_path / "left").rename(tmp_path / "images/left")
+    for name in sorted(scene.cameras)[:twice]:
+        shutil.copy(tmp_path / "images/left" / name, tmp_path / "images/right" / name)
+    said = (
+        rf"{twice} of the missing images are there several times, .*'frame_000\.png' may be (left|right)/frame_000\.png"
+    )
+    if twice == 3:
+        assert any(re.search(said, note) for note in load_capture(tmp_path).warnings)
+    else:
+        with pytest.raises(CaptureError, match=rf"12 of 12 images(?s:.*){said}"):
+            load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(images="images/left")).views) == 12
+
+
 def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path, scene):
     write_colmap(tmp_path, scene, text=True)
     file = tmp_path / "sparse/0/images.txt"
@@ -469,17 +429,6 @@ def test_images_of_one_name_in_two_folders_are_not_guessed(tmp_path, scene):
     file.write_text(text)
     with pytest.raises(CaptureError, match="12 of 12 images"):
         load_capture(tmp_path)
-
-
-def test_points_without_colors_are_remarked(tmp_path, scene):
-    write_transforms(tmp_path, scene)
-    assert load_capture(tmp_path).warnings == ()
-    cloud(tmp_path / "sparse_pc.ply", ("u",), "float", COLORS[:, :1], "ascii")
-    text = (tmp_path / "sparse_pc.ply").read_text()
-    for k in range(len(COLORS)):
-        text = text.replace("\n1 2 3 ", f"\n{k % 7} {k % 5} {k / 100} ", 1)
-    (tmp_path / "sparse_pc.ply").write_text(text)
-    assert any("bring no colors" in warning for warning in load_capture(tmp_path).warnings)
 
 
 # ------------------------------------------------------------------------------------------------- units

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from support.captures import (
-    write_ply,
-)
-from vdgs.captures.formats.ply_reader import read_point_cloud
+from support.captures import write_ply
+from support.dataset_layouts import write_transforms
+from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
+from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError
 
 FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -50,3 +52,102 @@ def test_damaged_point_clouds_end_in_a_message_or_points(tmp_path, data, text):
     with contextlib.suppress(CaptureError):
         points, colors = read_point_cloud(file)
         assert points.shape == colors.shape
+
+
+# ---------------------------------------------------------------------------------------------- colors
+
+COLORS = np.random.default_rng(5).integers(0, 256, (50, 3))
+
+
+def cloud(file: Path, names: tuple[str, ...], kind: str, values: np.ndarray, form: str) -> Path:
+    codes = {"uchar": "B", "ushort": "H", "int": "i", "float": "f", "double": "d"}
+    header = f"ply\nformat {form} 1.0\nelement vertex {len(values)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
+    cast = float if kind in ("float", "double") else int
+    if form == "ascii":
+        body = "".join(f"1 2 3 {' '.join(str(cast(v)) for v in row)}\n" for row in values).encode()
+    else:
+        code = f"{'<' if 'little' in form else '>'}3f{values.shape[1]}{codes[kind]}"
+        body = b"".join(struct.pack(code, 1, 2, 3, *map(cast, row)) for row in values)
+    file.write_bytes(header.encode() + body)
+    return file
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
+        ("Red", "Green", "Blue"), ("alpha", "R", "G", "B"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "factor"),
+    [
+        ("uchar", 1), ("ushort", 257), ("ushort", 1), ("int", 257), ("int", 1), ("float", 1 / 255), ("float", 1),
+        ("double", 257),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_colors_of_clouds_are_read_by_every_name_and_scale(tmp_path, names, kind, factor, form):
+    values = COLORS * factor
+    if len(names) == 4:
+        values = np.c_[values[:, :1], values]
+    points, found = read_point_cloud(cloud(tmp_path / "a.ply", names, kind, values, form))
+    assert (points == [1, 2, 3]).all()
+    assert np.abs(found.astype(int) - COLORS).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "factor", "beyond"),
+    [
+        ("float", 1 / 255, 1.004), ("double", 1 / 255, 3.7), ("float", 1.02 / 255, 1.02), ("float", 1 / 255, 255.0),
+        ("float", 1, 255.6), ("float", 1, 300.0), ("float", 1, 65535.0), ("ushort", 1, 256), ("ushort", 257, 65535),
+    ],
+)  # fmt: skip
+def test_a_few_colors_beyond_the_scale_are_clipped(tmp_path, kind, factor, beyond):
+    values = COLORS * factor
+    values[0] = beyond
+    found = read_point_cloud(cloud(tmp_path / "a.ply", ("red", "green", "blue"), kind, values, "ascii"))[1].astype(int)
+    assert np.abs(found[1:] - COLORS[1:]).max() <= 5  # two in a hundred where all are by that much too bright
+    assert (found[0] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [([[0.0, 1.0, 1.0]], [0, 255, 255]), ([[0.0, 1.0, 2.0]], [0, 1, 2]), ([[0, 0, 0]], [0] * 3)]
+)
+def test_whole_numbers_above_one_are_no_shares(tmp_path, values, expected):
+    file = cloud(tmp_path / "a.ply", ("red", "green", "blue"), "float", np.array(values * 9), "binary_little_endian")
+    assert (read_point_cloud(file)[1] == expected).all()
+
+
+def test_points_that_are_black_are_remarked(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    assert not any("black" in note for note in load_capture(tmp_path).warnings)
+    write_ply(tmp_path / "sparse_pc.ply", scene.points, np.minimum(scene.colors, 7))
+    assert any("points are all but black" in note for note in load_capture(tmp_path).warnings)
+
+
+def test_colors_of_splats_and_none_at_all(tmp_path):
+    coefficients = (COLORS / 255 - 0.5) / 0.28209479177387814
+    file = cloud(tmp_path / "a.ply", ("f_dc_0", "f_dc_1", "f_dc_2"), "float", coefficients, "binary_big_endian")
+    assert np.abs(read_point_cloud(file)[1].astype(int) - COLORS).max() <= 1
+    gray = cloud(tmp_path / "b.ply", ("u", "v"), "float", COLORS[:, :2], "binary_little_endian")
+    assert (read_point_cloud(gray)[1] == GRAY).all()
+
+
+def test_a_comment_ends_no_header(tmp_path):
+    file = cloud(tmp_path / "a.ply", ("red", "green", "blue"), "uchar", COLORS, "binary_big_endian")
+    file.write_bytes(file.read_bytes().replace(b"1.0\n", b"1.0\ncomment end_header is below\nobj_info 1\n", 1))
+    assert (read_point_cloud(file)[1] == COLORS).all()
+
+
+def test_points_without_colors_are_remarked(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    assert load_capture(tmp_path).warnings == ()
+    cloud(tmp_path / "sparse_pc.ply", ("u",), "float", COLORS[:, :1], "ascii")
+    text = (tmp_path / "sparse_pc.ply").read_text()
+    for k in range(len(COLORS)):
+        text = text.replace("\n1 2 3 ", f"\n{k % 7} {k % 5} {k / 100} ", 1)
+    (tmp_path / "sparse_pc.ply").write_text(text)
+    assert any("bring no colors" in warning for warning in load_capture(tmp_path).warnings)

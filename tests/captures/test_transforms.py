@@ -168,6 +168,20 @@ def test_lists_of_file_names_and_of_frames_that_are_not_there(tmp_path, scene):
     assert "(unregistered.png)" in said
 
 
+@pytest.mark.parametrize("key", ["test_filenames", "val_filenames", "test_frames"])
+def test_test_photographs_that_are_gone_are_replaced_by_no_others(tmp_path, scene, key):
+    names = sorted(scene.cameras)
+    content = write_transforms(tmp_path, scene)
+    held = [content["frames"].pop() for _ in range(2)] if key == "test_frames" else names[10:]
+    (tmp_path / "transforms.json").write_text(json.dumps(content | {key: held}))
+    (tmp_path / "images" / names[10]).unlink()
+    assert any("1 of its 2 test photographs are missing" in note for note in load_capture(tmp_path).warnings)
+    (tmp_path / "images" / names[11]).unlink()
+    with pytest.raises(CaptureError, match=r"transforms\.json: none of its 2 test photographs is there"):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(split="every")).views) == 10
+
+
 def test_test_frames_of_scannetpp_are_tested_on(tmp_path, scene):
     content = write_transforms(tmp_path, scene)
     content["frames"], content["test_frames"] = content["frames"][:8], content["frames"][8:]

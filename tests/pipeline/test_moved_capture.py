@@ -6,6 +6,7 @@ import json
 import shutil
 from contextlib import contextmanager
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -146,7 +147,12 @@ def test_films_and_pictures_fade_out_where_few_cameras_see(trained, tmp_path, mo
     for number in (0, 4, None, 2):
         asked = replace(path, min_visibility=number)
         render_run(replace(asked, output=tmp_path / f"{number}.mp4"), QUIET)
-        render_run(replace(asked, output=tmp_path / str(number)), QUIET)
+        console = Console(file=StringIO(), record=True, width=500)
+        render_run(replace(asked, output=tmp_path / str(number)), console)
+        said = console.export_text()
+        assert ("fewer than 2 training cameras see is faded out" in said) == (number is None)
+        written = json.loads((tmp_path / str(number) / "render.json").read_text())
+        assert written.get("min_visibility", 0) == (2 if number is None else number)
         pictures = [cv2.imread(str(file))[..., ::-1] for file in sorted((tmp_path / str(number)).glob("*.png"))]
         assert np.array_equal(pictures, frames[str(number)])
     opened = open_run(trained / "run")

@@ -16,6 +16,7 @@ from vdgs.captures.formats.colmap import (
     find_models,
     has_both_kinds,
     has_points,
+    larger_models_beside,
     partial_model,
     read_colmap,
 )
@@ -155,6 +156,12 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
         sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
         warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
     images, image_warnings = image_folder(root, options)
+    for larger in larger_models_beside(root, folder):
+        warnings.append(
+            f"{larger.relative_to(root)} holds {count_images(larger)} images, and {folder.relative_to(root)}, which is "
+            f"read, {count_images(folder)}. To use the larger: vdgs run {shell_word(larger)} --images "
+            f"{shell_word((root / images).absolute())} --output RUN"
+        )
     if has_both_kinds(folder):
         warnings.append(f"{folder.relative_to(root) / 'images.bin'} is read; images.txt beside it is not.")
     model = read_colmap(folder, options.strict)
@@ -170,8 +177,8 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
         elif needs_points:
             raise no_points(
                 root, options.images, f"{folder}: the model holds",
-                "Or keep points3D.bin beside images.bin, or put a point cloud in the same world there as "
-                f"{POINT_CLOUDS[0]}.",
+                "Or keep points3D.bin or points3D.txt beside the images of the model, or put a point cloud in the same "
+                f"world there as {POINT_CLOUDS[0]}.",
             )  # fmt: skip
     return SourceCapture(
         source="colmap", images=images, views=model.views, points=points, colors=colors,

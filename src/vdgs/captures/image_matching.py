@@ -19,7 +19,7 @@ from vdgs.captures.formats.source_capture import (
 )
 from vdgs.captures.image_files import find_images, is_turned, read_header, readable_suffixes, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
-from vdgs.captures.name_resolution import ImageNameIndex, find_in_other_folders
+from vdgs.captures.name_resolution import ImageNameIndex, find_in_other_folders, several_places
 from vdgs.captures.strays import masked_stem
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
@@ -50,7 +50,11 @@ def match_images(
     paths = [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]
     there = [path.is_file() for path in paths]
     missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
-    warnings += refuse_many_missing(missing, len(paths), folder, options.strict)
+    several = several_places(missing, available.images)
+    try:
+        warnings += [*refuse_many_missing(missing, len(paths), folder, options.strict), *several]
+    except CaptureError as error:
+        raise CaptureError("\n".join([str(error), *several])) from None
     views = tuple(view for view, found in zip(source.views, there, strict=True) if found)
     source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
     named = set(paths)

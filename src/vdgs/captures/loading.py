@@ -33,6 +33,8 @@ from vdgs.system.quoting import shell_word
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 MAX_DISTANCE_RATIO = 100.0
+#: Points are black where this share of their colors is at most so bright, of 255 (choice).
+NEARLY_ALL, BLACK = 0.99, 8
 
 
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
@@ -75,6 +77,11 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
     points, colors = ground.to_ground(source.points), source.colors
     if (colors == GRAY).all():
         warnings.append("the points bring no colors under a name that is known; the scene starts from gray.")
+    elif np.quantile(colors, NEARLY_ALL) <= BLACK:
+        warnings.append(
+            "the points are all but black, and so is what the scene starts from. Where photographs are not, the file "
+            "of the points has colors of an unusual scale: write them from 0 to 255."
+        )
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
         views = select_central_views(views, options.max_images)
@@ -85,7 +92,7 @@ def make_capture(root: Path, source: SourceCapture, options: CaptureOptions) -> 
         if not seen.any():
             raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
-    views = assign_splits(root, views, explicit, options, warnings)
+    views = assign_splits(root, views, explicit, options, warnings, images=source.images)
     off_path = [_view(photo, options, ground, "test") for photo in match_off_path(root, options, warnings)]
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,

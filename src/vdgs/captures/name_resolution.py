@@ -135,6 +135,20 @@ def find_in_other_folders(
     return single
 
 
+def several_places(names: Sequence[str], available: Collection[str]) -> list[str]:
+    """A sentence about names of a model without photograph that several in folders below may be; nothing where none is
+    of these."""
+    lookup = NameLookup((name, name) for name in available)
+    several = {name: found for name in names if len(found := lookup.find(name)[1]) > 1}
+    if not several:
+        return []
+    name, found = next(iter(several.items()))
+    return [
+        f"{len(several)} of the missing images are there several times, and which is meant is not known: {name!r} may "
+        f"be {found[0]} or {found[1]}. Give the folder of the right ones with --images."
+    ]
+
+
 def find_one(lookup: NameLookup[T], written: str, where: str, name_of: Callable[[T], str]) -> T:
     """The photograph that a line means, if need be in another folder. Raises CaptureError, which says `where` the line
     is, for a name of none and for one of several."""

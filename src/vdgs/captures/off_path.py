@@ -18,7 +18,7 @@ from vdgs.captures.capture import View
 from vdgs.captures.formats.colmap import find_models, read_colmap
 from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.image_matching import MatchedView, match_images
-from vdgs.captures.splits import VALIDATION_LIST, listed_photographs
+from vdgs.captures.split_lists import VALIDATION_LIST, listed_photographs
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 

@@ -53,6 +53,8 @@ class _Render:
     request: RenderRequest
     run: OpenedModel
     scene: Drawable
+    #: The number of training cameras below which the scene is faded out; 0: it is not.
+    faded_below: int
     run_cameras: RunCameras
     named: list[tuple[str, Camera]]
     console: Console
@@ -111,16 +113,25 @@ def render_run(request: RenderRequest, console: Console) -> None:
     run, scene = _open(request)
     run_cameras = _load_cameras(request, run)
     check_not_among_folders(request.output, run_cameras.root, run_cameras.input_folders)
-    scene = _with_fade(request, run, scene, run_cameras.cameras)
+    scene, faded_below = _with_fade(request, run, scene, run_cameras.cameras)
     run = replace(run, model=scene) if isinstance(scene, AnchorModel) else run
     print_warning(console, run.warning)
+    if faded_below and request.min_visibility is None:
+        console.print(
+            f"[yellow]note[/] what fewer than {faded_below} training cameras see is faded out, as in pictures of all "
+            "paths; --min-visibility 0 draws it as --views test and metrics do",
+            highlight=False,
+        )
     if request.seconds and request.path is None and request.views in ("test", "train"):
         console.print(f"[yellow]note[/] --seconds is of camera paths; --views {request.views} draws one frame a view")
     named, fps = _named_cameras(request, run_cameras)
     if request.width:
         named = [(name, camera.resized(request.width, _height(camera, request.width))) for name, camera in named]
     _check_size(request, [camera for _, camera in named])
-    job = _Render(request=request, run=run, scene=scene, run_cameras=run_cameras, named=named, console=console)
+    job = _Render(
+        request=request, run=run, scene=scene, faded_below=faded_below, run_cameras=run_cameras, named=named,
+        console=console,
+    )  # fmt: skip
     summary = _write_video(job, fps) if request.output.suffix else _write_images(job)
     job.warn_of_empty()
     seconds = time.monotonic() - began
@@ -136,15 +147,17 @@ def _open(request: RenderRequest) -> tuple[OpenedModel, Drawable]:
     return run, tree.at_error(request.lod_error)
 
 
-def _with_fade(request: RenderRequest, run: OpenedModel, scene: Drawable, cameras: Sequence[Camera]) -> Drawable:
-    """What is drawn, faded out where fewer of the training cameras see it than was asked for. Raises VdgsError where
-    nothing would be left; the default leaves scenes alone that so few see."""
+def _with_fade(
+    request: RenderRequest, run: OpenedModel, scene: Drawable, cameras: Sequence[Camera]
+) -> tuple[Drawable, int]:
+    """What is drawn, faded out where fewer of the training cameras see it than was asked for, and that number. Raises
+    VdgsError where nothing would be left; the default leaves scenes alone that so few see."""
     photographs = request.path is None and request.views in ("test", "train")
     least = request.min_visibility
     if least is None:
         least = 0 if photographs or request.mode != "rgb" else FADE_BELOW
     if not least:
-        return scene
+        return scene, 0
     if isinstance(scene, LodScene):
         visibility = count_visibility(scene.tree.gaussians(0).means, cameras)
     else:
@@ -152,11 +165,11 @@ def _with_fade(request: RenderRequest, run: OpenedModel, scene: Drawable, camera
     if request.min_visibility is not None:
         require_some_seen(visibility, least)
     elif not bool((visibility >= least).any()):
-        return scene
+        return scene, 0
     if isinstance(scene, LodScene):
         nearby = NearbyCameras(cameras)
-        return scene.with_fade(lambda places: nearby.fade_factors(places, least), f"V {least}")
-    return with_fade(run.model, cameras, least)
+        return scene.with_fade(lambda places: nearby.fade_factors(places, least), f"V {least}"), least
+    return with_fade(run.model, cameras, least), least
 
 
 def _check(request: RenderRequest) -> None:
@@ -202,7 +215,7 @@ def _write_images(job: _Render) -> str:
         write_png(output / f"{name}.png", image)
         if raw and values is not None:
             write_array(output / f"{name}.npy", values)
-    finish_render(output, earlier, names, _metadata(job.request, job.run.name, scalar_map))
+    finish_render(output, earlier, names, _metadata(job, scalar_map))
     sizes = list(dict.fromkeys(f"{camera.width}x{camera.height} px" for _, camera in job.named))
     summary = f"{_frame_count_text(len(job.named))} of {sizes[0] if len(sizes) == 1 else f'{len(sizes)} sizes'}"
     summary += ", each with its numbers as .npy" if raw else ""
@@ -213,13 +226,16 @@ def _frame_count_text(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _metadata(request: RenderRequest, model: str, scalar_map: ScalarMap | None) -> dict[str, object]:
+def _metadata(job: _Render, scalar_map: ScalarMap | None) -> dict[str, object]:
     """What render.json says of the images beside it."""
+    request, model = job.request, job.run.name
     views = request.views if request.path is None else str(request.path)
     run = str(request.run.resolve())
     metadata: dict[str, object] = {"run": run, "model": model, "mode": request.mode, "views": views}
     if request.lod_error is not None:
         metadata["lod_error"] = request.lod_error
+    if job.faded_below:
+        metadata["min_visibility"] = job.faded_below
     if request.is_antialiased and request.mode == "rgb":
         metadata["antialiased"] = True
     if scalar_map is not None:

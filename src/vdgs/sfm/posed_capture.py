@@ -26,7 +26,7 @@ from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
 from vdgs.captures.output_guard import check_output
 from vdgs.captures.reconstruction import DIGESTS_FILE, STEPS_FILE, WORK_FOLDER
-from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
+from vdgs.captures.split_lists import TEST_LIST, VALIDATION_LIST
 from vdgs.captures.up_axis import estimate_up
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import check_ranges

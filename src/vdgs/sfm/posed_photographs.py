@@ -21,7 +21,8 @@ from vdgs.captures.image_files import pillow_without_limits, read_header
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.image_tags import kind_of
 from vdgs.captures.reconstruction import read_digests
-from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST, held_out_by_capture
+from vdgs.captures.split_lists import TEST_LIST, VALIDATION_LIST
+from vdgs.captures.splits import held_out_by_capture
 from vdgs.captures.tiff_orientation import without_orientation
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.sfm_options import SfmRequest
@@ -88,7 +89,7 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
     root, warnings = capture_root(path), list[str]()
     source = _in_metres(read_source(path, options, needs_points=False))
     views, _ = match_images(root, source, options, warnings)
-    lists = held_out_by_capture(root, [view.view.name for view in views], options, warnings)
+    lists = held_out_by_capture(root, source.images, [view.view.name for view in views], options, warnings)
     views = sorted(_listed(views, lists, options, warnings), key=lambda view: view.view.name)
     training = sum(view.view.split != "test" for view in views)
     if training < 3:

@@ -14,7 +14,7 @@ from PIL import Image
 from vdgs import __version__
 from vdgs.captures.off_path import OFF_PATH_FOLDER
 from vdgs.captures.output_guard import check_output
-from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
+from vdgs.captures.split_lists import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.synth.dataset_writer import (

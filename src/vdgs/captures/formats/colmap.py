@@ -71,16 +71,18 @@ def read_colmap(folder: Path, strict: bool = False) -> ColmapModel:
         raise CaptureError(f"{folder}: no COLMAP model here (cameras and images, as .bin or .txt).")
     binary = suffix == ".bin"
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    points_file = folder / f"points3D{suffix}"
+    points_file = _points_file(folder)
     try:
         cameras = (read_cameras_binary if binary else read_cameras_text)(cameras_file)
         records = list((read_images_binary if binary else read_images_text)(images_file))
         points = empty_points()
-        if points_file.is_file():
-            points = (read_points3D_binary if binary else read_points3D_text)(points_file)
+        if points_file is not None:
+            points = (read_points3D_binary if points_file.suffix == ".bin" else read_points3D_text)(points_file)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
     views, notes = _views(records, cameras, points, images_file, strict)
+    if points_file is not None and points_file.suffix != suffix:
+        notes += (f"{points_file} is used; there is no points3D{suffix}, as of cameras and images.",)
     return ColmapModel(folder, views, points.positions, points.colors, notes)
 
 
@@ -98,13 +100,30 @@ def count_images(folder: Path) -> int:
 def has_points(folder: Path) -> bool:
     """Whether the model announces points, without reading it all."""
     try:
-        if _format(folder) == ".bin":
-            with (folder / "points3D.bin").open("rb") as stream:
+        file = _points_file(folder)
+        if file is None:
+            return False
+        if file.suffix == ".bin":
+            with file.open("rb") as stream:
                 return any(stream.read(8))
-        with (folder / "points3D.txt").open(encoding="utf-8-sig", errors="replace") as lines:
+        with file.open(encoding="utf-8-sig", errors="replace") as lines:
             return any(line.strip() and not line.lstrip().startswith("#") for line in lines)
     except OSError:
         return False
+
+
+def _points_file(folder: Path) -> Path | None:
+    """The points of a model: of the kind of its cameras and images, else of the other, as where some were converted."""
+    files = [folder / f"points3D{suffix}" for suffix in (".bin", ".txt")]
+    return next((file for file in (files if _format(folder) == ".bin" else files[::-1]) if file.is_file()), None)
+
+
+def larger_models_beside(root: Path, model: Path) -> list[Path]:
+    """Models beside those with numbers (sparse/geo beside sparse/0) that hold more images than `model`, which is read.
+    They are not: programs keep models of other steps there."""
+    parents = dict.fromkeys(folder.parent for folder in find_models(root) if folder.name.isdecimal())
+    beside = (entry for parent in parents for entry in sorted(parent.iterdir()) if not entry.name.isdecimal())
+    return [entry for entry in beside if _format(entry) is not None and count_images(entry) > count_images(model)]
 
 
 def has_both_kinds(folder: Path) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.ply_reader import GRAY
+from vdgs.captures.formats.ply_reader import GRAY, has_sixteen_bits
 from vdgs.errors import CaptureError
 
 #: A cloud of more points is thinned: the scene begins with fewer.
@@ -50,4 +50,4 @@ def read_las_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     points, rgb = np.concatenate(places), np.concatenate(colors)
     if not len(rgb):
         return points, np.full((len(points), 3), GRAY, np.uint8)
-    return points, (rgb if rgb.max(initial=0) <= 255 else rgb >> 8).astype(np.uint8)
+    return points, (rgb >> 8 if has_sixteen_bits(rgb) else rgb.clip(max=255)).astype(np.uint8)

@@ -32,7 +32,9 @@ from vdgs.captures.formats.source_capture import (
     WorldPrior,
     leave_out_bad_poses,
     one_view_each,
+    refuse_lost_tests,
     refuse_many_missing,
+    without_tested,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.image_files import read_header
@@ -40,7 +42,6 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 from vdgs.system.quoting import shell_word
-from vdgs.system.units import first_names
 
 #: The photographs that do not train.
 TEST_FILE, VALIDATION_FILE = "transforms_test.json", "transforms_val.json"
@@ -77,8 +78,9 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views: list[SourceView] = []
     scales: set[float] = set()
     missing: list[str] = []
+    lost: list[str] = []
     bad: dict[str, CaptureError] = {}
-    count, is_city = 0, False
+    count, tests, is_city = 0, 0, False
     photographs = FramePhotographs(root, options.images)
     for file, split in files:
         content = read_capture_json(file)
@@ -87,8 +89,10 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         for frame in get_frames(content, file):
             count, is_city = count + 1, is_city or _of_a_city(frame)
             image = photographs.find(frame, file, split)
+            tests += split == "test"
             if isinstance(image, str):
                 missing.append(image)
+                lost += [image] if split == "test" else []
                 continue
             try:
                 view, scale = _read_frame(image, frame, content, file, split, root)
@@ -98,8 +102,10 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
             views.append(view)
             scales.add(scale)
     warnings = _missing(missing, count, root / (options.images or ""), options.strict, is_city)
-    views, both = _without_tested(views)
-    views, warnings = one_view_each(views, root, bad), warnings + both
+    warnings += tuple(refuse_lost_tests(lost, tests, files[-1][0], options))
+    tested = {view.image_path for view in views if view.split == "test"}
+    views, both = without_tested(views, {view.name for view in views if view.image_path in tested})
+    views, warnings = one_view_each(views, root, bad), warnings + tuple(both)
     if any(file.name == VALIDATION_FILE for file, _ in files):
         warnings += (f"there is no {TEST_FILE}: the photographs of {VALIDATION_FILE} are for the test.",)
     warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
@@ -118,8 +124,7 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
             f"usual on white: without the points beside the set, vdgs sfm {shell_word(root)} --output CAPTURE makes it "
             "white.",
         )
-    one_split = {view.split for view in views} == {"train"}
-    if one_split:  # no test files: the split is ours to choose
+    if not tests:  # no test files: the split is ours to choose
         views = [replace(view, split=None) for view in views]
     return SourceCapture(
         source="matrixcity",
@@ -141,17 +146,6 @@ def _of_a_city(frame: JsonObject) -> bool:
     if "rot_mat" in frame or "frame_index" in frame:
         return True
     return any(CITY_PATTERN.fullmatch(part) for part in PurePosixPath(str(frame.get("file_path", ""))).parts)
-
-
-def _without_tested(views: list[SourceView]) -> tuple[list[SourceView], tuple[str, ...]]:
-    """The views without training views of photographs that are also for the test, and what to say of these."""
-    tested = {view.image_path for view in views if view.split == "test"}
-    both = [view.name for view in views if view.split == "train" and view.image_path in tested]
-    if not both:
-        return views, ()
-    said = "in the training file and in the test file; only for the test, not for training"
-    kept = [view for view in views if view.split == "test" or view.image_path not in tested]
-    return kept, (f"{first_names(both)}: {said}.",)
 
 
 def _missing(missing: list[str], count: int, folder: Path, strict: bool, is_city: bool) -> tuple[str, ...]:

@@ -8,7 +8,8 @@ describes the originals: the images are already undistorted.
 
 from __future__ import annotations
 
-from pathlib import Path
+import filecmp
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -20,8 +21,10 @@ from vdgs.captures.formats.source_capture import (
     SourceView,
     WorldPrior,
     check_intrinsics,
+    refuse_lost_tests,
     refuse_many_missing,
     to_rigid,
+    without_tested,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.image_files import find_images
@@ -32,7 +35,8 @@ from vdgs.system.documents import JsonObject
 
 #: Ground axes (right, forward, up) from DRB axes.
 GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-SPLIT_FOLDERS: tuple[tuple[str, Split], ...] = (("train", "train"), ("val", "test"))
+TEST_FOLDER = "val"
+SPLIT_FOLDERS: tuple[tuple[str, Split], ...] = (("train", "train"), (TEST_FOLDER, "test"))
 
 
 def is_mega_nerf(root: Path) -> bool:
@@ -63,6 +67,11 @@ def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = Tru
         raise CaptureError(
             f"{error}\n(For UrbanScene3D, copy the raw photographs as Mega-NeRF's README says.)"
         ) from None
+    lost = [name for name in missing if name.startswith(f"{TEST_FOLDER}/")]
+    tests = [view for view in views if view.split == "test"]
+    warnings += refuse_lost_tests(lost, len(tests) + len(lost), root / TEST_FOLDER, options)
+    views, both = without_tested(views, _also_tested(views, tests))
+    warnings += both
     poses = {view.name: view.camera_from_world for view in views}
     points, colors = find_sparse_points(
         root, poses, "Mega-NeRF's layout", _aliases(root, views), images=options.images, needs_points=needs_points
@@ -106,6 +115,21 @@ def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.nd
     )
 
 
+def _also_tested(views: list[SourceView], tests: list[SourceView]) -> set[str]:
+    """The names of training views whose photograph lies in both folders: under one name, with one pose or the same
+    bytes (some programs number each folder anew)."""
+    tested = {to_nfc(PurePosixPath(view.name).stem): view for view in tests}
+    pairs = [(view, tested.get(to_nfc(PurePosixPath(view.name).stem))) for view in views if view.split == "train"]
+    return {view.name for view, other in pairs if other is not None and _is_same(view, other)}
+
+
+def _is_same(one: SourceView, other: SourceView) -> bool:
+    if np.allclose(one.camera_from_world, other.camera_from_world, rtol=1e-6, atol=1e-6):
+        return True
+    a, b = one.image_path, other.image_path
+    return a is not None and b is not None and filecmp.cmp(a, b, shallow=False)
+
+
 def _load(file: Path) -> JsonObject:
     """A dictionary from a torch file; `weights_only`, so that nothing in it can run."""
     import torch  # here: other formats do without it, and it takes seconds
@@ -120,8 +144,11 @@ def _load(file: Path) -> JsonObject:
                 f"{file}: holds other things than tensors, texts and numbers, such as numbers of numpy, and these are "
                 "not read. Save it anew with tensors (torch.as_tensor) and numbers of Python (float)."
             ) from None
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CaptureError(f"{file}: cannot be read as a torch file ({first}). Copy it again.") from None
+        why = error.strerror if isinstance(error, OSError) else None
+        # without torch's own words, which advise to load it in a way that lets code in it run
+        raise CaptureError(
+            f"{file}: cannot be read as a torch file ({why or 'damaged, cut off, or of another kind'}). Copy it again."
+        ) from None
     if not isinstance(content, dict):
         raise CaptureError(f"{file}: must hold a dictionary.")
     return content

@@ -20,6 +20,11 @@ COLORS = (
     ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
     ("color_red", "color_green", "color_blue"), ("scalar_red", "scalar_green", "scalar_blue"), HARMONICS,
 )  # fmt: skip
+#: The share of a cloud's colors that decides their scale: a few may be beyond it (choice).
+BULK = 0.95
+#: Most colors above this times the smaller scale (1, 255) are of the larger one (255, 65535), on which others would be
+#: black (choice).
+DARK = 2.0
 SH_0 = 0.28209479177387814
 PLY_DTYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -41,9 +46,9 @@ class _Header:
 def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 and colors [n, 3] uint8 (mid-gray where the file has none).
 
-    Reads `ascii` and both binary formats, vertices first; floating-point colors may run from 0 to 1,
-    those of 16 bits to 65535. Raises `CaptureError` naming the file if it is missing, of another kind, or shorter than
-    it announces.
+    Reads `ascii` and both binary formats, vertices first; floating-point colors may run from 0 to 1, those of 16 bits
+    to 65535; a few that are larger are clipped. Raises `CaptureError` naming the file if it is missing, of another
+    kind, or shorter than it announces.
     """
     try:
         data = file.read_bytes()
@@ -137,9 +142,16 @@ def _colors(vertices: np.ndarray, types: Mapping[str, str]) -> np.ndarray:
 
 
 def _factor(colors: np.ndarray, kind: str) -> float:
-    """What brings colors to 0 to 255: numbers with a point may run to 1, and 16 bits to 65535, where they do."""
+    """What brings colors to 0 to 255, by most of them: numbers with a point may run to 1, and 16 bits to 65535."""
     finite = colors[np.isfinite(colors)]
-    largest = float(finite.max()) if len(finite) else 0.0
-    if "f" in kind and 0 < largest <= 1:
+    if not len(finite):
+        return 1.0
+    largest, fractions = float(finite.max()), bool((finite != np.round(finite)).any())
+    if "f" in kind and (0 < largest <= 1 or (fractions and np.quantile(finite, BULK) <= DARK)):
         return 255.0
-    return 1 / 257 if largest > 255 and "1" not in kind else 1.0
+    return 1 / 257 if "1" not in kind and has_sixteen_bits(finite) else 1.0
+
+
+def has_sixteen_bits(colors: np.ndarray) -> bool:
+    """Whether colors, of which there are some, run to 65535 and not to 255."""
+    return float(np.quantile(colors, BULK)) > 255 * DARK

@@ -6,7 +6,7 @@ already in OpenCV camera axes. `loading` turns it into a checked `Capture` in th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -16,6 +16,7 @@ import numpy as np
 from vdgs.captures.capture import Observations, Split
 from vdgs.captures.georeference import Georef
 from vdgs.captures.name_resolution import find_file, without_uri
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
@@ -153,6 +154,32 @@ def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict:
     more = len(missing) - MAX_MISSING_LISTED
     shown = ", ".join(missing[:MAX_MISSING_LISTED]) + (f", ... and {more} more" if more > 0 else "")
     return [f"{len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
+
+
+def refuse_lost_tests(lost: Sequence[str], count: int, where: Path, options: CaptureOptions) -> list[str]:
+    """A warning about test photographs of a set that are not there, of `count`; CaptureError where none is, unless a
+    person has chosen another split: photographs that the set trains on would be tested on instead."""
+    if not lost or options.test_list is not None or options.split not in ("auto", "explicit"):
+        return []
+    if len(lost) == count:
+        raise CaptureError(
+            f"{where}: none of its {count} test photographs is there. Copy them there, choose the folder that test "
+            "and training photographs are in with --images, name others with --test-list, or keep some of those that "
+            f"train for the test: --split every.{format_list(lost, MAX_MISSING_LISTED)}"
+        )
+    return [
+        f"{where}: {len(lost)} of its {count} test photographs are missing; figures are of the others, not of the "
+        "whole test set."
+    ]
+
+
+def without_tested(views: list[SourceView], tested: Collection[str]) -> tuple[list[SourceView], list[str]]:
+    """The views without those for training whose photographs, by their names, are `tested` too, and what to say of
+    these."""
+    kept = [view for view in views if view.split == "test" or view.name not in tested]
+    both = [view.name for view in views if view.split != "test" and view.name in tested]
+    said = "among the photographs for training and among those for the test; only for the test, not for training"
+    return kept, [f"{first_names(both)}: {said}."] if both else []
 
 
 def leave_out_bad_poses(bad: Mapping[str, CaptureError], count: int, file: Path, strict: bool = False) -> list[str]:

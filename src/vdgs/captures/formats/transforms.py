@@ -32,6 +32,7 @@ from vdgs.captures.formats.source_capture import (
     find_image,
     leave_out_bad_poses,
     one_view_each,
+    refuse_lost_tests,
     refuse_many_missing,
     safe_name,
     to_rigid,
@@ -88,11 +89,12 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     names, chosen, notes = photographs.names, photographs.folder, photographs.notes
     splits = _splits(content, names, names[count:], file, options, notes)
     undo = _undo_applied(content, file)
-    views, poses, missing = list[SourceView](), dict[str, np.ndarray](), list[str]()
+    views, poses, missing, lost = list[SourceView](), dict[str, np.ndarray](), list[str](), list[str]()
     bad = dict[str, CaptureError]()
     for frame, name, short, image in zip(frames, names, photographs.shorts, photographs.images, strict=True):
         if image is None:
             missing.append(short)
+            lost += [short] if splits.get(name) == "test" else []
             continue
         short += image.suffix if image.stem == PurePosixPath(short).name else ""
         try:
@@ -114,6 +116,8 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
             )
         )
     warnings = notes + refuse_many_missing(missing, len(frames), root / chosen, options.strict)
+    tests = [splits.get(name) for name in names].count("test")
+    warnings += refuse_lost_tests(lost, tests, file, options)
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}

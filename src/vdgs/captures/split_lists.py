@@ -1,0 +1,90 @@
+"""The lists of test and validation photographs that a capture brings.
+
+`test.txt` and `validation.txt` lie in the capture, beside the folder of its photographs, or beside its COLMAP model,
+where 3DGS reads them, one name a line; or the `train_test_lists.json` of ScanNet++ does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from vdgs.captures.formats.colmap import find_models
+from vdgs.captures.formats.listed_names import find_listed
+from vdgs.errors import CaptureError
+
+#: Lists that a capture may bring.
+TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
+#: The list for the test by its names, the first that is there counts.
+TEST_LISTS = (TEST_LIST, "train_test_lists.json")
+
+
+def own_list(
+    root: Path, images: str, names: Sequence[str], photographs: Sequence[str], notes: list[str]
+) -> Path | None:
+    """The list of one of these names that counts in a capture whose photographs lie in `images`; None where there is
+    none. Notes say where it is, if not in the capture's folder, and which lists beside it name other `photographs`."""
+    lists = _lists_of(root, images, names)
+    if not lists:
+        return None
+    used, *others = lists
+    what = "validation" if used.name == VALIDATION_LIST else "the test"
+    if used.parent != root:
+        notes.append(f"{used} says which photographs are for {what}.")
+    meant = _meant(used, photographs)
+    for other in others:
+        if _meant(other, photographs) != meant:
+            notes.append(f"{other} names other photographs for {what} than {used}, and is not used. Keep one list.")
+    return used
+
+
+def _lists_of(root: Path, images: str, names: Sequence[str]) -> list[Path]:
+    """The lists of these names that a capture brings, the one that counts first."""
+    photographs = root / images
+    beside = [] if os.path.abspath(photographs) == os.path.abspath(root) else [photographs.parent]
+    found = dict[Path, Path]()
+    for file in (folder / name for name in names for folder in (root, *beside, *find_models(root))):
+        if file.is_file():
+            found.setdefault(file.resolve(), file)
+    return list(found.values())
+
+
+def _meant(file: Path, photographs: Sequence[str]) -> set[str] | None:
+    """The photographs that a list names; None where it cannot be read."""
+    try:
+        return listed_photographs(file, photographs, some=False)[0]
+    except CaptureError:
+        return None
+
+
+def listed_photographs(
+    file: Path, names: Sequence[str], *, some: bool, strict: bool = False
+) -> tuple[set[str], list[str]]:
+    """Those of `names` that a text file lists, one a line, or a JSON file under `test`, and a warning about those that
+    mean none of them. Raises CaptureError for a list that cannot be read or names nothing where `some` are needed, and
+    as `find_listed`."""
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CaptureError(f"{file}: is not UTF-8 text ({error}). Save it as UTF-8.") from None
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from None
+    lines = _names_in_json(file, text) if file.suffix.lower() == ".json" else text.splitlines()
+    wanted = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if some and not wanted:
+        how = "Name images in the list under test" if file.suffix.lower() == ".json" else "Write one image name a line"
+        raise CaptureError(f"{file}: names no photograph. {how}, or ignore lists with --split every.")
+    return find_listed(wanted, names, str(file), strict=strict)
+
+
+def _names_in_json(file: Path, text: str) -> list[str]:
+    """The list `test` of a JSON file. Raises CaptureError where there is none."""
+    try:
+        names = json.loads(text)["test"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        names = None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise CaptureError(f'{file}: must hold {{"test": [names of photographs]}}. Write that, or use --split every.')
+    return names
