@@ -135,6 +135,19 @@ def test_lists_beside_the_photographs_are_read_and_said(tmp_path, scene, name, i
     assert held_out == {"test.txt": set(names[3:5]), "validation.txt": {names[5]}}
 
 
+def test_a_file_beside_photographs_elsewhere_that_names_none_of_them_is_not_theirs(tmp_path, scene):
+    """A test.txt of somebody's home, say."""
+    root = tmp_path / "capture"
+    write_colmap(root, scene)
+    (root / "images").rename(tmp_path / "photographs")
+    expected = load_capture(root, up(images=str(tmp_path / "photographs"))).test_views
+    for text in ("buy milk\n", "", "\x00\x01"):
+        (tmp_path / "test.txt").write_text(text)
+        capture = load_capture(root, up(images=str(tmp_path / "photographs")))
+        assert [view.name for view in capture.test_views] == [view.name for view in expected]
+        assert f"{tmp_path / 'test.txt'} names no photograph of this capture, and is not used." in capture.warnings
+
+
 def test_lists_that_contradict_each_other_are_said(folder, scene):
     names = sorted(scene.cameras)
     (folder / "test.txt").write_text(f"{names[3]}\n{names[7]}\n")

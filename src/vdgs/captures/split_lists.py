@@ -25,8 +25,12 @@ def own_list(
     root: Path, images: str, names: Sequence[str], photographs: Sequence[str], notes: list[str]
 ) -> Path | None:
     """The list of one of these names that counts in a capture whose photographs lie in `images`; None where there is
-    none. Notes say where it is, if not in the capture's folder, and which lists beside it name other `photographs`."""
+    none. Notes say where it is, if not in the capture's folder, and which lists beside it name other `photographs`. A
+    file outside the capture that names none of them is another's."""
     lists = _lists_of(root, images, names)
+    strays = [file for file in lists if not _is_inside(file, root) and not _meant(file, photographs)]
+    notes += [f"{file} names no photograph of this capture, and is not used." for file in strays]
+    lists = [file for file in lists if file not in strays]
     if not lists:
         return None
     used, *others = lists
@@ -49,6 +53,10 @@ def _lists_of(root: Path, images: str, names: Sequence[str]) -> list[Path]:
         if file.is_file():
             found.setdefault(file.resolve(), file)
     return list(found.values())
+
+
+def _is_inside(file: Path, root: Path) -> bool:
+    return Path(os.path.abspath(file)).is_relative_to(os.path.abspath(root))
 
 
 def _meant(file: Path, photographs: Sequence[str]) -> set[str] | None:
