@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from experiments.microbench import gpu
+from experiments.microbench import gpu, gpu_training
 from support.captures import tiny_scene, write_colmap
 from support.cuda_on_host import host_compiler, needs_nvrtc
 from support.fake_device import CARD, pretended_card
@@ -100,3 +101,18 @@ def test_what_there_is_no_time_for_is_named(capsys):
 @pytest.mark.parametrize("size", [float("nan"), float("inf"), 2e-4])
 def test_a_number_that_is_none_is_no_agreement(size):
     assert not gpu.gpu_parity.Difference("decode", "", "conics", "value", size).agrees
+
+
+def test_steps_of_a_training_are_told_by_what_they_draw(tmp_path, capsys):
+    """On the processor, of which the profiler tells nothing."""
+    write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    train_step = gpu_training.training_loop.train_step
+    command = ["train-coarse", str(tmp_path / "capture"), "--output", str(tmp_path / "run"), "--device", "cpu"]
+    rest = ["--iterations", "40", "--preset", "laptop", "--quiet", "--densify.start", "5"]
+    assert gpu_training.main(["--", *command, *rest]) == 0
+    said = capsys.readouterr().out
+    # Iterations 28 to 39: of these every second compares depths, and every fourth has a pseudo view besides.
+    for kind, count in (("plain", 6), ("with depths", 3), ("with depths and pseudo view", 3)):
+        assert re.search(rf"^{kind} +[\d.]+ ms, median of {count}$", said, re.MULTILINE), said
+    assert gpu_training.training_loop.train_step is train_step
+    assert gpu_training.main(["--", *command, "--no-such-option"]) == 2
