@@ -128,6 +128,8 @@ def test_photographs_of_the_test_file_that_are_gone_are_replaced_by_no_others(tm
     (tmp_path / "mine.txt").write_text("train/0004.png")
     mine = load_capture(tmp_path, CaptureOptions(test_list=tmp_path / "mine.txt"))
     assert [view.name for view in mine.test_views] == ["train/0004.png"]
+    (tmp_path / "mine.txt").rename(tmp_path / "test.txt")  # as a list that the capture brings does
+    assert [view.name for view in load_capture(tmp_path).test_views] == ["train/0004.png"]
 
 
 def test_without_test_file_the_validation_is_the_test(tmp_path, both):

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from support.captures import TinyScene, data_folder, tiny_scene, write_colmap, write_images
+from support.captures import TinyScene, data_folder, tiny_scene, write_colmap, write_images, write_ply
 from vdgs.captures.formats.colmap import has_points, read_colmap
 from vdgs.captures.formats.source_capture import CAMERA_MODELS
 from vdgs.captures.loading import load_capture
@@ -237,6 +237,11 @@ def test_points_of_the_other_kind_are_read_where_there_are_no_others(tmp_path, t
     capture = load_capture(tmp_path, CaptureOptions(up="z"))
     assert len(capture.points) == len(scene.points)
     assert any(f"points3D{kinds[1]} is used; there is no points3D{kinds[0]}" in note for note in capture.warnings)
+    (folder / f"points3D{kinds[1]}").write_bytes(b"1 x\n" if kinds[1] == ".txt" else bytes([9] * 20))
+    write_ply(folder / "points3D.ply", scene.points[:40], scene.colors[:40])
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert len(capture.points) == 40
+    assert any(f"points3D{kinds[1]}" in note and "It is not used" in note for note in capture.warnings)
     (folder / f"points3D{kinds[1]}").unlink()
     assert not has_points(folder)
 

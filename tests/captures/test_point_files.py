@@ -121,6 +121,15 @@ def test_whole_numbers_above_one_are_no_shares(tmp_path, values, expected):
     assert (read_point_cloud(file)[1] == expected).all()
 
 
+@pytest.mark.parametrize(("kind", "factor"), [("ushort", 257), ("float", 1 / 255), ("double", 0.997)])
+def test_points_without_a_color_say_nothing_of_the_scale(tmp_path, kind, factor):
+    """As scanners write them: black, and most of all."""
+    values = np.concatenate([COLORS * factor, np.zeros((40 * len(COLORS), 3))])
+    found = read_point_cloud(cloud(tmp_path / "a.ply", ("red", "green", "blue"), kind, values, "ascii"))[1].astype(int)
+    assert np.abs(found[: len(COLORS)] - COLORS).max() <= 1
+    assert (found[len(COLORS) :] == 0).all()
+
+
 def test_points_that_are_black_are_remarked(tmp_path, scene):
     write_transforms(tmp_path, scene)
     assert not any("black" in note for note in load_capture(tmp_path).warnings)

@@ -145,7 +145,24 @@ def test_a_file_beside_photographs_elsewhere_that_names_none_of_them_is_not_thei
         (tmp_path / "test.txt").write_text(text)
         capture = load_capture(root, up(images=str(tmp_path / "photographs")))
         assert [view.name for view in capture.test_views] == [view.name for view in expected]
-        assert f"{tmp_path / 'test.txt'} names no photograph of this capture, and is not used." in capture.warnings
+        assert (
+            f"{tmp_path / 'test.txt'} names other photographs than this capture has, and is not used."
+            in capture.warnings
+        )
+
+
+def test_of_a_list_beside_photographs_elsewhere_half_must_fit_and_what_cannot_be_read_is_said(tmp_path, scene):
+    root, names, options = tmp_path / "capture", sorted(scene.cameras), up(images=str(tmp_path / "photographs"))
+    write_colmap(root, scene)
+    (root / "images").rename(tmp_path / "photographs")
+    file = tmp_path / "test.txt"
+    file.write_text("\n".join([names[2], "a.jpg", "b.jpg"]))
+    assert [view.name for view in load_capture(root, options).test_views] != [names[2]]
+    file.write_text("\n".join([names[2], "a.jpg"]))
+    assert [view.name for view in load_capture(root, options).test_views] == [names[2]]
+    file.write_text(names[2], encoding="utf-16")
+    with pytest.raises(CaptureError, match=r"test\.txt: is not UTF-8 text .* --split every"):
+        load_capture(root, options)
 
 
 def test_lists_that_contradict_each_other_are_said(folder, scene):

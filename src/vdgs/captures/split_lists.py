@@ -13,12 +13,12 @@ from pathlib import Path
 
 from vdgs.captures.formats.colmap import find_models
 from vdgs.captures.formats.listed_names import find_listed
+from vdgs.captures.formats.source_capture import TEST_LISTS
+from vdgs.captures.name_resolution import NameLookup
 from vdgs.errors import CaptureError
 
 #: Lists that a capture may bring.
-TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
-#: The list for the test by its names, the first that is there counts.
-TEST_LISTS = (TEST_LIST, "train_test_lists.json")
+TEST_LIST, VALIDATION_LIST = TEST_LISTS[0], "validation.txt"
 
 
 def own_list(
@@ -26,10 +26,10 @@ def own_list(
 ) -> Path | None:
     """The list of one of these names that counts in a capture whose photographs lie in `images`; None where there is
     none. Notes say where it is, if not in the capture's folder, and which lists beside it name other `photographs`. A
-    file outside the capture that names none of them is another's."""
+    file outside the capture of whose names less than half are theirs is another's."""
     lists = _lists_of(root, images, names)
-    strays = [file for file in lists if not _is_inside(file, root) and not _meant(file, photographs)]
-    notes += [f"{file} names no photograph of this capture, and is not used." for file in strays]
+    strays = [file for file in lists if not _is_inside(file, root) and _is_of_others(file, photographs)]
+    notes += [f"{file} names other photographs than this capture has, and is not used." for file in strays]
     lists = [file for file in lists if file not in strays]
     if not lists:
         return None
@@ -55,6 +55,18 @@ def _lists_of(root: Path, images: str, names: Sequence[str]) -> list[Path]:
     return list(found.values())
 
 
+def _is_of_others(file: Path, photographs: Sequence[str]) -> bool:
+    """Whether less than half of what a list names are these photographs; False where it cannot be read, which is an
+    error once it counts."""
+    try:
+        wanted = _names_in(file)
+    except CaptureError:
+        return False
+    lookup = NameLookup((name, name) for name in photographs)
+    known = sum(bool(lookup.find(name)[1]) for name in wanted)
+    return not wanted or 2 * known < len(wanted)
+
+
 def _is_inside(file: Path, root: Path) -> bool:
     return Path(os.path.abspath(file)).is_relative_to(os.path.abspath(root))
 
@@ -73,18 +85,24 @@ def listed_photographs(
     """Those of `names` that a text file lists, one a line, or a JSON file under `test`, and a warning about those that
     mean none of them. Raises CaptureError for a list that cannot be read or names nothing where `some` are needed, and
     as `find_listed`."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise CaptureError(f"{file}: is not UTF-8 text ({error}). Save it as UTF-8.") from None
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from None
-    lines = _names_in_json(file, text) if file.suffix.lower() == ".json" else text.splitlines()
-    wanted = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    wanted = _names_in(file)
     if some and not wanted:
         how = "Name images in the list under test" if file.suffix.lower() == ".json" else "Write one image name a line"
         raise CaptureError(f"{file}: names no photograph. {how}, or ignore lists with --split every.")
     return find_listed(wanted, names, str(file), strict=strict)
+
+
+def _names_in(file: Path) -> list[str]:
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CaptureError(
+            f"{file}: is not UTF-8 text ({error}). Save it as UTF-8, or ignore lists with --split every."
+        ) from None
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from None
+    lines = _names_in_json(file, text) if file.suffix.lower() == ".json" else text.splitlines()
+    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
 def _names_in_json(file: Path, text: str) -> list[str]:

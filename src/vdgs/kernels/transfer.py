@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import threading
+import weakref
 from collections.abc import MutableMapping
 from typing import Any
 
@@ -35,6 +37,8 @@ class DeviceCopies:
     def __init__(self) -> None:
         self._kept: MutableMapping[Tensor, Tensor] = WeakIdKeyDictionary()
         self._room: int | None = None
+        self._bytes = 0
+        self._lock = threading.RLock()  # originals are dropped by any thread, at any time
 
     def part(self, tensor: Tensor, inside: tuple[slice, ...], device: torch.device) -> Tensor:
         """`tensor[inside]` on a device."""
@@ -47,10 +51,16 @@ class DeviceCopies:
             return kept
         if self._room is None:
             self._room = int(COPIES_SHARE * torch.cuda.mem_get_info(device)[0])
-        if tensor.nbytes + sum(copy.nbytes for copy in self._kept.values()) > self._room:
+        if tensor.nbytes + self._bytes > self._room:
             return None
+        self._count(tensor.nbytes)
+        weakref.finalize(tensor, self._count, -tensor.nbytes)
         self._kept[tensor] = upload(tensor, device)
         return self._kept[tensor]
+
+    def _count(self, change: int) -> None:
+        with self._lock:
+            self._bytes += change
 
 
 def is_host(tensor: Tensor) -> bool:

@@ -75,14 +75,11 @@ def read_colmap(folder: Path, strict: bool = False) -> ColmapModel:
     try:
         cameras = (read_cameras_binary if binary else read_cameras_text)(cameras_file)
         records = list((read_images_binary if binary else read_images_text)(images_file))
-        points = empty_points()
-        if points_file is not None:
-            points = (read_points3D_binary if points_file.suffix == ".bin" else read_points3D_text)(points_file)
+        points, of_points = _read_points(points_file, suffix)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
     views, notes = _views(records, cameras, points, images_file, strict)
-    if points_file is not None and points_file.suffix != suffix:
-        notes += (f"{points_file} is used; there is no points3D{suffix}, as of cameras and images.",)
+    notes += of_points
     return ColmapModel(folder, views, points.positions, points.colors, notes)
 
 
@@ -110,6 +107,20 @@ def has_points(folder: Path) -> bool:
             return any(line.strip() and not line.lstrip().startswith("#") for line in lines)
     except OSError:
         return False
+
+
+def _read_points(file: Path | None, suffix: str) -> tuple[ColmapPoints, tuple[str, ...]]:
+    """The points of a model whose cameras and images end in `suffix`, and what to say of a file of the other kind: one
+    that cannot be read is left, for points may come from elsewhere."""
+    if file is None:
+        return empty_points(), ()
+    read = read_points3D_binary if file.suffix == ".bin" else read_points3D_text
+    if file.suffix == suffix:
+        return read(file), ()
+    try:
+        return read(file), (f"{file} is used; there is no points3D{suffix}, as of cameras and images.",)
+    except CaptureError as error:
+        return empty_points(), (f"{error} It is not used; there is no points3D{suffix} beside it.",)
 
 
 def _points_file(folder: Path) -> Path | None:

@@ -102,7 +102,7 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
             views.append(view)
             scales.add(scale)
     warnings = _missing(missing, count, root / (options.images or ""), options.strict, is_city)
-    warnings += tuple(refuse_lost_tests(lost, tests, files[-1][0], options))
+    warnings += tuple(refuse_lost_tests(lost, tests, files[-1][0], root, options))
     tested = {view.image_path for view in views if view.split == "test"}
     views, both = without_tested(views, {view.name for view in views if view.image_path in tested})
     views, warnings = one_view_each(views, root, bad), warnings + tuple(both)

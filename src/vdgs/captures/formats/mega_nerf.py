@@ -69,7 +69,7 @@ def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = Tru
         ) from None
     lost = [name for name in missing if name.startswith(f"{TEST_FOLDER}/")]
     tests = [view for view in views if view.split == "test"]
-    warnings += refuse_lost_tests(lost, len(tests) + len(lost), root / TEST_FOLDER, options)
+    warnings += refuse_lost_tests(lost, len(tests) + len(lost), root / TEST_FOLDER, root, options)
     views, both = without_tested(views, _also_tested(views, tests))
     warnings += both
     poses = {view.name: view.camera_from_world for view in views}

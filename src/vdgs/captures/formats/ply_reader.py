@@ -22,8 +22,7 @@ COLORS = (
 )  # fmt: skip
 #: The share of a cloud's colors that decides their scale: a few may be beyond it (choice).
 BULK = 0.95
-#: Most colors above this times the smaller scale (1, 255) are of the larger one (255, 65535), on which others would be
-#: black (choice).
+#: Fractions of which most are at most this run to 1: of 255 they would be black (choice).
 DARK = 2.0
 SH_0 = 0.28209479177387814
 PLY_DTYPES = {
@@ -147,11 +146,17 @@ def _factor(colors: np.ndarray, kind: str) -> float:
     if not len(finite):
         return 1.0
     largest, fractions = float(finite.max()), bool((finite != np.round(finite)).any())
-    if "f" in kind and (0 < largest <= 1 or (fractions and np.quantile(finite, BULK) <= DARK)):
+    if "f" in kind and (0 < largest <= 1 or (fractions and _bulk(finite) <= DARK)):
         return 255.0
     return 1 / 257 if "1" not in kind and has_sixteen_bits(finite) else 1.0
 
 
 def has_sixteen_bits(colors: np.ndarray) -> bool:
-    """Whether colors, of which there are some, run to 65535 and not to 255."""
-    return float(np.quantile(colors, BULK)) > 255 * DARK
+    """Whether colors run to 65535 and not to 255."""
+    return _bulk(colors) > 255
+
+
+def _bulk(colors: np.ndarray) -> float:
+    """What all but a few are at most, of those that are not black: scanners write points without a color as black."""
+    lit = colors[colors > 0]
+    return float(np.quantile(lit, BULK)) if lit.size else 0.0

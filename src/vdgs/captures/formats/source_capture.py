@@ -135,6 +135,10 @@ class SourceCapture:
     warnings: tuple[str, ...] = field(default=())
 
 
+#: The list for the test that a capture may bring, by its names; the first that is there counts.
+TEST_LISTS = ("test.txt", "train_test_lists.json")
+
+
 def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict: bool = False) -> list[str]:
     """A warning about photographs that have a camera but are not there; CaptureError where too few are left, and of any
     where a person is `strict`."""
@@ -156,10 +160,13 @@ def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict:
     return [f"{len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
 
 
-def refuse_lost_tests(lost: Sequence[str], count: int, where: Path, options: CaptureOptions) -> list[str]:
+def refuse_lost_tests(lost: Sequence[str], count: int, where: Path, root: Path, options: CaptureOptions) -> list[str]:
     """A warning about test photographs of a set that are not there, of `count`; CaptureError where none is, unless a
-    person has chosen another split: photographs that the set trains on would be tested on instead."""
+    person has chosen another split, by a list in the capture too: photographs that the set trains on would be tested on
+    instead."""
     if not lost or options.test_list is not None or options.split not in ("auto", "explicit"):
+        return []
+    if any((root / name).is_file() for name in TEST_LISTS):  # which counts more than what the set says
         return []
     if len(lost) == count:
         raise CaptureError(

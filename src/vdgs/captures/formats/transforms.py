@@ -117,7 +117,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
         )
     warnings = notes + refuse_many_missing(missing, len(frames), root / chosen, options.strict)
     tests = [splits.get(name) for name in names].count("test")
-    warnings += refuse_lost_tests(lost, tests, file, options)
+    warnings += refuse_lost_tests(lost, tests, file, root, options)
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
