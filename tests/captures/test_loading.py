@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from support.captures import TinyScene, data_folder, render_plane, tiny_scene, write_colmap, write_images
+from support.captures import UP, TinyScene, data_folder, render_plane, tiny_scene, up, write_colmap, write_images
 from vdgs.captures import undistortion
 from vdgs.captures.formats.source_capture import Intrinsics, SourceView
 from vdgs.captures.image_cache import load_image
@@ -28,18 +28,6 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.pipeline.image_size import image_sizes
 from vdgs.runs.run_settings import with_absolute_paths
-
-UP = CaptureOptions(up="z")
-
-
-def up(**options) -> CaptureOptions:
-    return CaptureOptions(up="z", **options)
-
-
-@pytest.fixture
-def folder(tmp_path, scene):
-    write_colmap(tmp_path, scene)
-    return tmp_path
 
 
 def test_options_import_nothing_heavy():

@@ -6,23 +6,10 @@ import json
 
 import pytest
 
-from support.captures import TinyScene, write_colmap, write_images
+from support.captures import UP, TinyScene, up, write_colmap, write_images
 from vdgs.captures.loading import load_capture
 from vdgs.captures.splits import held_out_by_capture
-from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-
-UP = CaptureOptions(up="z")
-
-
-def up(**options) -> CaptureOptions:
-    return CaptureOptions(up="z", **options)
-
-
-@pytest.fixture
-def folder(tmp_path, scene):
-    write_colmap(tmp_path, scene)
-    return tmp_path
 
 
 def test_validation_leaves_the_test_photographs_out(folder, scene):

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import pytest
 
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
 
@@ -28,6 +29,13 @@ if TYPE_CHECKING:
     from vdgs.captures.capture import Capture
 
 MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4}
+#: How the z of a tiny scene's files is told to be up.
+UP = CaptureOptions(up="z")
+
+
+def up(**options: Any) -> CaptureOptions:
+    """That with other options."""
+    return replace(UP, **options)
 
 
 @dataclass(frozen=True)
