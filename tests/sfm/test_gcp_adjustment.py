@@ -18,12 +18,15 @@ pytest.importorskip("pyproj")
 import pyproj
 
 from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, sightings, write_photograph
+from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import gcp_table, read_reconstruction, report_rows
+from vdgs.captures.reconstruction import gcp_table, is_finished, read_reconstruction, report_rows
+from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
-from vdgs.sfm import incremental_mapper
+from vdgs.sfm import capture_writer, incremental_mapper
+from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left
 from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
@@ -308,7 +311,7 @@ def test_the_stated_accuracy_of_few_points_holds(count, wrong):
     assert (beyond <= 0.1 * surveys).all()
 
 
-def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: str):
+def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path | None, *held_out: str):
     output = tmp_path / "capture"
     if not output.exists():
         shutil.copytree(made, output, symlinks=True)
@@ -355,6 +358,56 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     assert rows["Check points"].startswith("2, held out: RMSE 0.")
     assert [row[0] for row in gcp_table(facts)] == list(NAMES)
     assert read_reconstruction(tmp_path / "capture") == facts
+
+
+@pytest.mark.parametrize("then", ["the old command", "the new command"])
+def test_photographs_of_another_lens_are_written_all_or_none(made, flight, points, tmp_path, monkeypatch, then):
+    """Control points tell another lens; stopped among the photographs, the capture is not finished."""
+    file = write_list(tmp_path / "gcp_list.txt", flight, points)
+    surveyed(made, flight, tmp_path, None)
+    monkeypatch.setattr(reconstructing, "LENS_PX", 0.0)
+    before, write, output = written(tmp_path / "capture"), capture_writer.write_images, tmp_path / "capture"
+
+    def stopped(folder, work, names, *rest):
+        write(folder, work, {number: members[:4] for number, members in names.items()}, *rest)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(capture_writer, "write_images", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            surveyed(made, flight, tmp_path, file)
+    assert not is_finished(output)
+    assert not (output / "sparse").exists()
+    assert len(written(output)) < len(before)
+    _, capture, said = surveyed(made, flight, tmp_path, file if then == "the new command" else None)
+    assert "placed anew" in said
+    assert validate_capture(capture).problems == ()
+    assert (written(output) == before) is (then == "the old command")
+    assert "nothing to do" in surveyed(made, flight, tmp_path, file if then == "the new command" else None)[2]
+    assert (output / "work" / "database.db").is_file()  # asked to keep
+
+
+def written(capture: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(capture)): file.read_bytes() for file in capture.glob("images*/*")}
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", (3000.0, 2000, 1500, -0.05)),
+        ("OPENCV", (3000.0, 3010, 2000, 1500, -0.05, 0.01, 0.001, -0.001)),
+        ("OPENCV_FISHEYE", (1500.0, 1500, 2000, 1500, 0.01, -0.002, 0.001, 0.0005)),
+    ],
+)
+def test_every_term_of_a_lens_moves_photographs(model, params):
+    lens = Intrinsics(model, params, 4000, 3000)
+    assert capture_writer.lens_shift_px({1: lens}, {1: lens}) == 0
+    assert capture_writer.lens_shift_px({}, {1: lens}) == np.inf
+    for k in range(len(params)):
+        other = replace(lens, params=(*params[:k], params[k] + (0.01 if params[k] < 1 else 5), *params[k + 1 :]))
+        assert capture_writer.lens_shift_px({1: lens}, {1: other}) > reconstructing.LENS_PX
+        slight = replace(lens, params=(*params[:k], params[k] * (1 + 1e-8), *params[k + 1 :]))
+        assert capture_writer.lens_shift_px({1: lens}, {1: slight}) < reconstructing.LENS_PX
 
 
 def test_a_national_datum_counts_in_the_place_of_control_points(made, flight, points, tmp_path):

@@ -96,7 +96,8 @@ def make_posed_capture(
         _match(photographs, work, request, threads, console)
         model = _triangulate(photographs, work, threads, console)
         if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
-            for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
+            finished.forget(CAPTURE)  # before: an interrupted removal is no finished capture
+            for name in (*capture_writer.IMAGE_FOLDERS, "sparse"):
                 shutil.rmtree(output / name, ignore_errors=True)
             for name in ("georef.json", TEST_LIST, VALIDATION_LIST):
                 (output / name).unlink(missing_ok=True)
