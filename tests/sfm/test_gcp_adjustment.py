@@ -28,8 +28,15 @@ from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.sfm import capture_writer, incremental_mapper
 from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.feature_extraction import CameraGroup
-from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left
-from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
+from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left, triangulate
+from vdgs.sfm.gcp_list import (
+    GcpList,
+    GcpObservation,
+    GroundControlPoint,
+    are_along_line,
+    check_gcps_near,
+    read_gcp_list,
+)
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
@@ -166,6 +173,32 @@ def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
     assert "held out as check points" in "".join(found.notes)
     places = [np.array([point.geodetic for point in each.points]) for each in (found, sound)]
     assert places[0] == pytest.approx(places[1], abs=1e-6)
+
+
+@pytest.mark.parametrize(("heading", "height"), [("z (ft)", 600), ("z", 600), ("z [m]", 182.88)])
+def test_heights_of_a_system_in_feet_are_converted_once(flight, tmp_path, heading, height):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    marks = [(k, name) for k in range(3) for name in flight.names[:2]]
+    rows = [f"{3112000 + 100 * k},{10070000 + 50 * k**2},{height},9,9,{name},{k}" for k, name in marks]
+    file.write_text("\n".join(["EPSG:2277+6360", f"x,y,{heading},px,py,photograph,name", *rows]))
+    heights = [point.geodetic[2] for point in read_gcp_list(file, collection, ()).points]
+    assert heights == pytest.approx([182.88] * 3, abs=1e-3)
+
+
+def test_marks_that_are_left_with_one_photograph_keep_their_place():
+    """Three marks in one photograph, one in another: without the worst no other place is shown."""
+    model, turn = pycolmap.Reconstruction(), np.diag([1.0, -1, -1])
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=4000, height=3000, params=[3000, 3000, 2000, 1500], camera_id=1)
+    )
+    for k, name in enumerate("AB", 1):
+        pose = pycolmap.Rigid3d(np.column_stack([turn, -turn @ [10.0 * k, 0, 50]]))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=k), pose)
+    marks = (("A", (2300.0, 1500.0)), ("A", (2305.0, 1505.0)), ("A", (2310.0, 1500.0)), ("B", (1700.0, 2000.0)))
+    point = GroundControlPoint("P", (0, 0, 0), tuple(GcpObservation(*mark) for mark in marks), False)
+    found = triangulate(model, point)
+    assert found.agreeing == point.observations
+    assert found.error_px == found.kept_px > 100
 
 
 def test_heights_that_are_not_known_are_told_from_zeros(flight, tmp_path):

@@ -54,7 +54,6 @@ from vdgs.sfm.reconstruction_plan import (
 )
 from vdgs.sfm.reconstruction_report import (
     ReconstructionResult,
-    cameras_of,
     check_enough_placed,
     exclusion_reasons,
     make_reconstruction_report,
