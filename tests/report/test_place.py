@@ -159,7 +159,7 @@ def test_when_a_place_was_flown(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("longitude", "said"), [(179.9999, "179.99"), (-179.9999, "179.99"), (8.0, "° E"), (-8.0, "° W")]
+    ("longitude", "said"), [(179.9999, "179.99"), (-179.99999, "179.99"), (8.0, "° E"), (-8.0, "° W")]
 )
 def test_longitudes_run_on_across_the_antimeridian(tmp_path, longitude, said):
     place = place_of(tmp_path / "island", GEOREF | {"origin_lon_deg": longitude})

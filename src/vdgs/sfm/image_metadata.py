@@ -314,8 +314,8 @@ def _not_an_image(path: Path) -> str:
 
 
 def _is_panorama(found: ImageTags, xmp: Mapping[str, str]) -> bool:
-    """Whether a photograph shows all directions, equirectangular, by Google's XMP. Raises UnusableImage for panoramas of
-    other projections, and for parts."""
+    """Whether a photograph shows all directions, equirectangular, by Google's XMP. Raises UnusableImage for
+    panoramas of other projections, and for parts."""
     projection = text(xmp, "GPano:ProjectionType")
     if not projection:
         return False
