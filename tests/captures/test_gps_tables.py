@@ -196,6 +196,7 @@ def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
     assert found.gps_std[0] == pytest.approx([0.5, 0.5, 1.5])
     assert any("3 rows are of photographs that are not there; left out (4.jpg, 5.jpg, 6.jpg)" in n for n in found.notes)
     assert any("1 of 8 rows have no position" in note for note in found.notes)
+    assert found.are_stated.tolist() == [True] * 4
 
 
 def test_rows_that_are_there_twice_are_of_photographs_that_are_there(tmp_path):
@@ -203,6 +204,7 @@ def test_rows_that_are_there_twice_are_of_photographs_that_are_there(tmp_path):
     rows = "".join(f"{name},-33.5{k},-70.6,500\n" for k, name in enumerate(NAMES))
     (file := tmp_path / "gps.csv").write_text(f"name,lat,lon,alt\n{rows}{rows}")
     found = read_gps_priors(seen, file, (1.0, 2.0))
+    assert not found.are_stated.any()
     assert len(found) == len(NAMES)
     assert not any("not there" in note for note in found.notes)
 
