@@ -64,6 +64,21 @@ def test_units_of_the_columns_of_x_and_y_count(tmp_path, system, names, factors)
         read_gps_table(named)
 
 
+@pytest.mark.parametrize("words", ["600", "600 ft", "182.88 m"])
+@pytest.mark.parametrize("heading", ["z", "z [ft]", "z (m)"])
+@pytest.mark.parametrize(
+    "system",
+    ["EPSG:2277+6360\nname,x,y,{z}\na.jpg,3112000,10070000", "EPSG:4269+6360\nname,lat,lon,{z}\na.jpg,30.2,-97.7"],
+)
+def test_heights_of_a_system_in_feet_are_converted_once(tmp_path, system, heading, words):
+    """NAVD88 in feet: whatever says the unit of a height, a word, its heading or the system."""
+    if heading == "z (m)" and words == "600":
+        words = "182.88"
+    (tmp_path / "t.csv").write_text(system.format(z=heading.replace("z", "alt")) + f",{words}\n")
+    ((*_, height),) = (row.position for row in read_gps_table(tmp_path / "t.csv").rows)
+    assert height == pytest.approx(182.88, abs=1e-3)
+
+
 def test_degrees_under_a_system_in_metres_are_refused(tmp_path):
     rows = [
         f"{name} {PLACE[0] + k / 9000:.8f} {PLACE[1]:.8f} 500"

@@ -36,6 +36,7 @@ TABLES = {
     "exiftool, words": "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n"
     "./a.jpg,\"33 deg 30' 0.00\"\" S\",\"70 deg 36' 0.00\"\" W\",500 m Above Sea Level\n",
     "references": "file,latitude,GPSLatitudeRef,longitude,GPSLongitudeRef,altitude\na.jpg,33.5,South,70.6,W,500\n",
+    "references in Chinese": "file,latitude,latitude ref,longitude,longitude ref,alt\na.jpg,33.5,南纬,70.6,西经,500\n",
     "metashape": "# Cameras (1)\n#Label,X/Longitude,Y/Latitude,Z/Altitude,Error_(m)\na.jpg,-70.6,-33.5,500,\n# end\n",
     "metashape, system": '# CoordinateSystem: GEOGCS["WGS 84",AUTHORITY["EPSG","4326"]]\n'
     "#Label,X/Longitude,Y/Latitude,Z/Altitude\na,-70.6,-33.5,500\n",
@@ -195,6 +196,7 @@ def test_rows_of_photographs_that_are_gone_are_left_out_and_said(tmp_path):
     assert found.gps_std[0] == pytest.approx([0.5, 0.5, 1.5])
     assert any("3 rows are of photographs that are not there; left out (4.jpg, 5.jpg, 6.jpg)" in n for n in found.notes)
     assert any("1 of 8 rows have no position" in note for note in found.notes)
+    assert found.are_stated.tolist() == [True] * 4
 
 
 def test_rows_that_are_there_twice_are_of_photographs_that_are_there(tmp_path):
@@ -202,6 +204,7 @@ def test_rows_that_are_there_twice_are_of_photographs_that_are_there(tmp_path):
     rows = "".join(f"{name},-33.5{k},-70.6,500\n" for k, name in enumerate(NAMES))
     (file := tmp_path / "gps.csv").write_text(f"name,lat,lon,alt\n{rows}{rows}")
     found = read_gps_priors(seen, file, (1.0, 2.0))
+    assert not found.are_stated.any()
     assert len(found) == len(NAMES)
     assert not any("not there" in note for note in found.notes)
 
@@ -455,6 +458,15 @@ def test_hemispheres_and_units_of_angles_are_read_wherever_they_are_said(tmp_pat
 def test_angles_that_may_mean_two_things_are_refused(tmp_path, head, row, said):
     (file := tmp_path / "t.csv").write_text(f"name,{head}\na.jpg,{row}\n")
     with pytest.raises(CaptureError, match=f"line 2: .*{said}.* Write"):
+        read_gps_table(file)
+
+
+@pytest.mark.parametrize("side", ["Юг", "Etelä", "E", "1"])
+def test_words_that_are_no_sides_are_refused(tmp_path, side):
+    (file := tmp_path / "t.csv").write_text(
+        f"name,latitude,latitude ref,longitude,longitude ref\na.jpg,33.5,{side},70.6,W\n", encoding="utf-8"
+    )
+    with pytest.raises(CaptureError, match=f"line 2: '{side}' is no side of a latitude. Write N or S instead"):
         read_gps_table(file)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from support.captures import data_folder, moved, tiny_scene, to_source, write_colmap
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
+from vdgs.captures.georeference import LOCAL_FRAME
 from vdgs.captures.ground_estimation import NOMINAL_CAMERA_HEIGHT, find_ground_frame, transform_pose
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.export.local_frame import default_crs, make_local_frame
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_ecef, geodetic_from_enu
+from vdgs.geometry.map_projection import MapProjection
 from vdgs.geometry.similarity import fit_similarity, fit_similarity_robust, geometric_median, rotation_to_z
 
 ORIGIN = (46.8426, -91.994, 159.4)
@@ -160,6 +164,19 @@ def test_gps_gives_meters_and_east_north_up(tmp_path, wrong):
     np.testing.assert_allclose(enu_from_geodetic(np.array([frame.origin_geo]), ORIGIN)[0], offset[0], atol=1e-4)
 
 
+def test_what_a_table_leaves_in_doubt_counts_in_the_place(tmp_path):
+    """An ellipsoid alone names no datum."""
+    truth = at_several_heights()
+    gps = write_gps(tmp_path / "gps.csv", truth, noise=0.02)
+    sure, warnings = ground_of(truth, tmp_path, gps=gps)
+    assert not warnings
+    assert "place ±0.0" in sure.accuracy
+    gps.write_text("+proj=longlat +ellps=bessel +no_defs\n" + gps.read_text())
+    doubtful, warnings = ground_of(truth, tmp_path, gps=gps)
+    assert "no datum: taken as WGS 84" in "".join(warnings)
+    assert "place ±300 m" in doubtful.accuracy
+
+
 def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
     truth = tiny_scene(columns=6, rows=1)
     for name, camera in truth.cameras.items():
@@ -283,6 +300,25 @@ def test_a_far_origin_is_moved_so_that_float32_is_safe(tmp_path, near):
     np.testing.assert_allclose(to_source(frame, ground), scene.points, rtol=1e-15)
     assert (frame.origin_geo is not None) == near
     assert any("projected coordinates (UTM)" in warning for warning in warnings) == (not near)
+
+
+def test_the_grid_of_a_site_is_moved_for_float32_and_given_back(tmp_path):
+    """Metres without a place on Earth: maps and files stand where the site's own coordinates say."""
+    (tmp_path / "georef.json").write_text(json.dumps({"frame": LOCAL_FRAME}))
+    frame, warnings = ground_of(tiny_scene(), tmp_path)
+    assert MapProjection.of(frame).crs == "local"
+    scene = moved(tiny_scene(), 1.0, np.eye(3), np.array([512_345.4, 5_678_901.7, 20.0]))
+    frame, warnings = ground_of(scene, tmp_path)
+    assert not warnings
+    assert frame.origin_geo is None
+    assert frame.metric
+    ground = frame.to_ground(scene.points)
+    assert np.abs(ground).max() < 100
+    np.testing.assert_allclose(MapProjection.of(frame).project(ground), scene.points, rtol=1e-15)
+    for name in ("a.ply", "a.laz", "a.spz"):
+        local = make_local_frame(frame, default_crs(frame, Path(name)), np.median(ground, axis=0))
+        np.testing.assert_allclose(local.apply(ground) + local.facts.origin, scene.points, atol=1e-6)
+        assert np.abs(local.apply(ground)).max() < 1000
 
 
 @pytest.mark.parametrize(

@@ -405,6 +405,20 @@ def test_the_map_of_a_lens_is_made_once_for_all_its_photographs(tmp_path, monkey
     assert asked == lenses
 
 
+def test_a_damaged_photograph_has_no_sound_copy(tmp_path):
+    """Cut off and filled with zeros, it decodes; its copy without distortion would be a whole file."""
+    file, lens = tmp_path / "a.jpg", Intrinsics("SIMPLE_RADIAL", (500.0, 320.0, 240.0, -0.05), 640, 480)
+    picture = cv2.resize(np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8), (640, 480))
+    whole = cv2.imencode(".jpg", picture)[1].tobytes()
+    file.write_bytes(whole)
+    photographs, half = [ImageFile("a.jpg", file, None, lens)], len(whole) // 2
+    undistortion.undistort(tmp_path / "straight", photographs)
+    file.write_bytes(whole[:half] + bytes(len(whole) - half))
+    with pytest.raises(CaptureError, match=r"a\.jpg"):
+        undistortion.undistort(tmp_path / "straight", photographs)
+    assert not (tmp_path / "straight" / "a.jpg.json").exists()
+
+
 def test_a_map_takes_little_more_memory_than_itself():
     lens = Intrinsics("OPENCV", (900.0, 905.0, 640.0, 480.0, -0.1, 0.02, 0.004, -0.003), 1280, 960)
     pinhole = undistorted_pinhole(lens)

@@ -36,8 +36,8 @@ def matched(tmp_path: Path, names: list[str], *rows: str) -> dict[str, float]:
     """Latitudes that a table of rows `name` and `latitude` gives photographs."""
     file = tmp_path / "gps.csv"
     file.write_text("name,lat,lon,alt\n" + "".join(f"{row},20,5\n" for row in rows), encoding="utf-8")
-    indices, positions, _ = match_gps(names, file)
-    return {names[index]: float(position[0]) for index, position in zip(indices, positions, strict=True)}
+    found = match_gps(names, file)
+    return {names[index]: float(place[0]) for index, place in zip(found.images, found.geodetic, strict=True)}
 
 
 def card(folder: Path, *names: str) -> Path:

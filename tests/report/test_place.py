@@ -158,8 +158,21 @@ def test_when_a_place_was_flown(tmp_path):
     assert first_and_last(["0000:00:00 00:00:00", "", "yesterday"]) == ()
 
 
+@pytest.mark.parametrize(
+    ("longitude", "said"), [(179.9999, "179.99"), (-179.99999, "179.99"), (8.0, "° E"), (-8.0, "° W")]
+)
+def test_longitudes_run_on_across_the_antimeridian(tmp_path, longitude, said):
+    place = place_of(tmp_path / "island", GEOREF | {"origin_lon_deg": longitude})
+    west, east = place.longitudes
+    assert 0 < east - west < 0.1
+    text = dict(place_rows(place))["Latitude, longitude"]
+    assert said in text
+    assert ("° E to 179.99" in text) is (abs(longitude) > 179)
+
+
 def test_areas_for_people():
     assert [format_area(area, "m") for area in (None, 812.4, 25_300.0, 3_400_000.0)] == [
         "unknown", "812 m²", "2.53 ha", "3.4 km²"
     ]  # fmt: skip
+    assert format_area(1_234_000_000.0, "m") == "1,234 km²"
     assert format_area(25_300.0, "units") == "25,300 square units"

@@ -18,15 +18,25 @@ pytest.importorskip("pyproj")
 import pyproj
 
 from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, sightings, write_photograph
+from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import gcp_table, read_reconstruction, report_rows
+from vdgs.captures.reconstruction import gcp_table, is_finished, read_reconstruction, report_rows
+from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
-from vdgs.sfm import incremental_mapper
+from vdgs.sfm import capture_writer, incremental_mapper
+from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.feature_extraction import CameraGroup
-from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left
-from vdgs.sfm.gcp_list import GcpList, are_along_line, check_gcps_near, read_gcp_list
+from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left, triangulate
+from vdgs.sfm.gcp_list import (
+    GcpList,
+    GcpObservation,
+    GroundControlPoint,
+    are_along_line,
+    check_gcps_near,
+    read_gcp_list,
+)
 from vdgs.sfm.image_list import ExcludedImage, ImageList, collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
@@ -163,6 +173,32 @@ def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
     assert "held out as check points" in "".join(found.notes)
     places = [np.array([point.geodetic for point in each.points]) for each in (found, sound)]
     assert places[0] == pytest.approx(places[1], abs=1e-6)
+
+
+@pytest.mark.parametrize(("heading", "height"), [("z (ft)", 600), ("z", 600), ("z [m]", 182.88)])
+def test_heights_of_a_system_in_feet_are_converted_once(flight, tmp_path, heading, height):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    marks = [(k, name) for k in range(3) for name in flight.names[:2]]
+    rows = [f"{3112000 + 100 * k},{10070000 + 50 * k**2},{height},9,9,{name},{k}" for k, name in marks]
+    file.write_text("\n".join(["EPSG:2277+6360", f"x,y,{heading},px,py,photograph,name", *rows]))
+    heights = [point.geodetic[2] for point in read_gcp_list(file, collection, ()).points]
+    assert heights == pytest.approx([182.88] * 3, abs=1e-3)
+
+
+def test_marks_that_are_left_with_one_photograph_keep_their_place():
+    """Three marks in one photograph, one in another: without the worst no other place is shown."""
+    model, turn = pycolmap.Reconstruction(), np.diag([1.0, -1, -1])
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=4000, height=3000, params=[3000, 3000, 2000, 1500], camera_id=1)
+    )
+    for k, name in enumerate("AB", 1):
+        pose = pycolmap.Rigid3d(np.column_stack([turn, -turn @ [10.0 * k, 0, 50]]))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=k), pose)
+    marks = (("A", (2300.0, 1500.0)), ("A", (2305.0, 1505.0)), ("A", (2310.0, 1500.0)), ("B", (1700.0, 2000.0)))
+    point = GroundControlPoint("P", (0, 0, 0), tuple(GcpObservation(*mark) for mark in marks), False)
+    found = triangulate(model, point)
+    assert found.agreeing == point.observations
+    assert found.error_px == found.kept_px > 100
 
 
 def test_heights_that_are_not_known_are_told_from_zeros(flight, tmp_path):
@@ -308,7 +344,7 @@ def test_the_stated_accuracy_of_few_points_holds(count, wrong):
     assert (beyond <= 0.1 * surveys).all()
 
 
-def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: str):
+def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path | None, *held_out: str):
     output = tmp_path / "capture"
     if not output.exists():
         shutil.copytree(made, output, symlinks=True)
@@ -355,6 +391,56 @@ def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, poin
     assert rows["Check points"].startswith("2, held out: RMSE 0.")
     assert [row[0] for row in gcp_table(facts)] == list(NAMES)
     assert read_reconstruction(tmp_path / "capture") == facts
+
+
+@pytest.mark.parametrize("then", ["the old command", "the new command"])
+def test_photographs_of_another_lens_are_written_all_or_none(made, flight, points, tmp_path, monkeypatch, then):
+    """Control points tell another lens; stopped among the photographs, the capture is not finished."""
+    file = write_list(tmp_path / "gcp_list.txt", flight, points)
+    surveyed(made, flight, tmp_path, None)
+    monkeypatch.setattr(reconstructing, "LENS_PX", 0.0)
+    before, write, output = written(tmp_path / "capture"), capture_writer.write_images, tmp_path / "capture"
+
+    def stopped(folder, work, names, *rest):
+        write(folder, work, {number: members[:4] for number, members in names.items()}, *rest)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(capture_writer, "write_images", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            surveyed(made, flight, tmp_path, file)
+    assert not is_finished(output)
+    assert not (output / "sparse").exists()
+    assert len(written(output)) < len(before)
+    _, capture, said = surveyed(made, flight, tmp_path, file if then == "the new command" else None)
+    assert "placed anew" in said
+    assert validate_capture(capture).problems == ()
+    assert (written(output) == before) is (then == "the old command")
+    assert "nothing to do" in surveyed(made, flight, tmp_path, file if then == "the new command" else None)[2]
+    assert (output / "work" / "database.db").is_file()  # asked to keep
+
+
+def written(capture: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(capture)): file.read_bytes() for file in capture.glob("images*/*")}
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", (3000.0, 2000, 1500, -0.05)),
+        ("OPENCV", (3000.0, 3010, 2000, 1500, -0.05, 0.01, 0.001, -0.001)),
+        ("OPENCV_FISHEYE", (1500.0, 1500, 2000, 1500, 0.01, -0.002, 0.001, 0.0005)),
+    ],
+)
+def test_every_term_of_a_lens_moves_photographs(model, params):
+    lens = Intrinsics(model, params, 4000, 3000)
+    assert capture_writer.lens_shift_px({1: lens}, {1: lens}) == 0
+    assert capture_writer.lens_shift_px({}, {1: lens}) == np.inf
+    for k in range(len(params)):
+        other = replace(lens, params=(*params[:k], params[k] + (0.01 if params[k] < 1 else 5), *params[k + 1 :]))
+        assert capture_writer.lens_shift_px({1: lens}, {1: other}) > reconstructing.LENS_PX
+        slight = replace(lens, params=(*params[:k], params[k] * (1 + 1e-8), *params[k + 1 :]))
+        assert capture_writer.lens_shift_px({1: lens}, {1: slight}) < reconstructing.LENS_PX
 
 
 def test_a_national_datum_counts_in_the_place_of_control_points(made, flight, points, tmp_path):

@@ -33,7 +33,7 @@ from vdgs.geometry.geodesy import ecef_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
-from vdgs.sfm import feature_extraction, feature_matching
+from vdgs.sfm import feature_extraction, feature_matching, posed_capture
 from vdgs.sfm.posed_capture import make_posed_capture
 from vdgs.sfm.posed_photographs import _in_metres, read_posed_photographs
 from vdgs.sfm.posed_plan import plan_posed_capture
@@ -101,6 +101,17 @@ def test_points_lie_on_the_ground_and_poses_stay(town_flight: tuple[Path, KnownF
     assert len({view.intrinsics for view in read_colmap(tmp_path / "capture" / "sparse" / "0").views}) == 8
     assert len(np.unique(capture.point_colors, axis=0)) > 100
     assert "nothing to do" in ask(root, tmp_path / "capture")
+
+
+@pytest.mark.usefixtures("few_features")
+def test_damaged_photographs_are_named_before_the_work(town_flight, tmp_path, monkeypatch) -> None:
+    root, flight = _some_photographs(town_flight, tmp_path)
+    project_writers.write_odm_report(root, flight)
+    file = root / "images" / flight.names[1]
+    file.write_bytes(file.read_bytes()[:300])
+    monkeypatch.setattr(posed_capture, "_match", _stop)
+    with pytest.raises(CaptureError, match=flight.names[1]):
+        ask(root, tmp_path / "capture")
 
 
 @pytest.mark.usefixtures("few_features")

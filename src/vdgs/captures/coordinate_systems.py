@@ -159,6 +159,17 @@ def _unit_without_heights(crs: Any) -> float:
     return float(crs.axis_info[0].unit_conversion_factor) if len(crs.axis_info) == 2 and crs.is_projected else 1.0
 
 
+def height_unit(header: str | None) -> float:
+    """Metres in the unit of the heights of a system that `to_geodetic` knows; 1 for no system, and for one without
+    heights."""
+    if header is None:
+        return 1.0
+    import pyproj
+
+    axes = pyproj.CRS.from_user_input(_named(header)).axis_info
+    return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
+
+
 def _to_latitude(crs: Any, target: str) -> Callable[..., tuple[Any, ...]]:
     """What brings x, y and, of three axes, z of a system to latitude, longitude and height of `target`.
 

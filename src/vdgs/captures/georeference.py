@@ -88,9 +88,24 @@ def _by_number(names: Sequence[str]) -> _Find:
     return lambda number: ((0, 0), found.get(int(number), []) if number.isdecimal() else [])
 
 
-def match_gps(names: Sequence[str], file: Path) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Indices [m] of the images that a table has a position of, the positions [m, 3] (latitude, longitude, altitude),
-    and whether their altitudes are known (0 where not; where all are exactly 0, too).
+@dataclass(frozen=True, eq=False)
+class GpsPositions:
+    """The positions that a table has of the images of a capture."""
+
+    images: np.ndarray
+    """Indices [m] of the images."""
+    geodetic: np.ndarray
+    """Latitude, longitude (degrees) and altitude (metres) [m, 3]."""
+    has_altitudes: bool
+    """Whether altitudes are known (0 where not; where all are exactly 0, too)."""
+    notes: tuple[str, ...]
+    """What the table leaves in doubt."""
+    datum_error_m: float
+    """How far all places may be off by the datum of the table's system."""
+
+
+def match_gps(names: Sequence[str], file: Path) -> GpsPositions:
+    """The positions of those images that a table has one of.
 
     Raises `CaptureError` as `read_gps_table` and `match_rows` do.
     """
@@ -100,7 +115,8 @@ def match_gps(names: Sequence[str], file: Path) -> tuple[np.ndarray, np.ndarray,
     positions = without_zero_altitudes(positions, every)
     kept, has_altitudes = with_altitudes(positions[:, 2], every)
     positions = np.where([True, True, has_altitudes], positions, 0.0)
-    return np.array(list(found), int)[kept], positions[kept], has_altitudes
+    images = np.array(list(found), int)[kept]
+    return GpsPositions(images, positions[kept], has_altitudes, table.notes, table.datum_error_m)
 
 
 def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbered: bool = False) -> dict[int, GpsRow]:

@@ -21,6 +21,7 @@ from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
 from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
     datum_error,
+    height_unit,
     in_units_of,
     is_in_degrees,
     join_definition,
@@ -39,6 +40,7 @@ from vdgs.captures.table_columns import (
     number_of,
     parted_angles,
     plain_number,
+    told_meters,
     west_or_east,
     with_names,
     with_sides,
@@ -105,8 +107,8 @@ class _Columns(NamedTuple):
     """Which word of a row is what."""
     system: str | None
     """The coordinate system that the table names."""
-    altitude_unit: float = 1.0
-    """Metres in one of its altitudes."""
+    altitude_unit: float | None = None
+    """Metres in one of its altitudes; None where their heading does not say, which are in the system's unit."""
     note: str = ""
     """How columns are read that do not say it themselves."""
     heights: tuple[str, ...] = ()
@@ -153,7 +155,8 @@ def read_gps_table(file: Path) -> GpsTable:
     place = _projected if columns.system is not None and "x" in columns.where else _geodetic
     positions = place(placed, columns, file)
     if place is _geodetic and columns.system is not None:
-        changed = to_geodetic(columns.system, file)[0](np.array(positions)[:, [1, 0, 2]])
+        given = np.array(positions)[:, [1, 0, 2]] / [1, 1, height_unit(columns.system)]
+        changed = to_geodetic(columns.system, file)[0](given)
         positions = [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)]
     found = [
         GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
@@ -168,7 +171,7 @@ def read_gps_table(file: Path) -> GpsTable:
         read, *others = map(repr, columns.heights)
         notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
     system = "" if columns.system is None else to_geodetic(columns.system, file)[1]
-    system = system if columns.altitude_unit == 1 else system.removesuffix(HEIGHTS_IN_METERS)
+    system = system if columns.altitude_unit in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
     if doubt := system.partition("; ")[2]:
         notes.append(f"{file.name}: {doubt}.")
     datum_error_m, converted = 0.0, ""
@@ -202,7 +205,7 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
             f"{file}: has minutes and seconds in columns of their own ({', '.join(map(repr, parts))}). Write each "
             "angle into one column: name,lat,lon,alt with degrees such as -33.51234, or words such as 33 30 44.4 S."
         )
-    unit = meters_of(rows[0].words[known["alt"]]) if "alt" in known else 1.0
+    unit = told_meters(rows[0].words[known["alt"]]) if "alt" in known else None
     others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
     heights = (rows[0].words[known["alt"]], *others) if others else ()
     named = {what: rows[0].words[known[what]] for what in _DEVIATIONS if what in known}
@@ -330,7 +333,8 @@ def _other_degrees(latitude: float, longitude: float) -> str:
 
 def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, file: Path) -> float | None:
     """An angle of a row in the unit of its column; its own side counts before that of another column or the heading's.
-    Raises CaptureError for numbers that the heading says to be no decimal ones, and for an O that may be either side.
+    Raises CaptureError for numbers that the heading says to be no decimal ones, for an O that may be either side, and
+    for words in a column of sides that are none.
     """
     word, side_word, heading = _word(row, columns, what), _word(row, columns, reference), columns.angles.get(what)
     if _O.search(word) or side_word.upper() == "O":
@@ -341,7 +345,7 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
         word, side_word = _O.sub(columns.o_side, word), _O.sub(columns.o_side, side_word)
     if word.count(",") == 1 and "." not in word:
         word = word.replace(",", ".")
-    side_word = side_word[:1] or (heading.side if heading is not None else "")
+    side_word = _side(side_word, axis, f"{file}: line {row.number}") or (heading.side if heading is not None else "")
     try:
         number = float(word)
         read: tuple[float, bool] | None = (number, False)
@@ -363,7 +367,20 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
     return side[0] if side is not None and side[1] else read[0]
 
 
+def _side(word: str, axis: str, where: str) -> str:
+    """N, S, E or W by the word of a column of sides; nothing where it is empty. Raises CaptureError."""
+    if word.lower() in UNKNOWN:
+        return ""
+    positive, negative = ("N", "S") if axis == "latitude" else ("E", "W")
+    for said in (word, word.split()[0]):  # `South latitude`
+        side = degrees_of_text(f"1 {said}", axis)
+        if side is not None and side[1]:
+            return positive if side[0] > 0 else negative
+    raise CaptureError(f"{where}: {word!r} is no side of a {axis}. Write {positive} or {negative} instead.")
+
+
 def _altitude(row: Row, columns: _Columns, file: Path) -> float:
+    """The altitude of a row in metres, NaN where it has none."""
     word = _word(row, columns, "alt")
     if word.lower() in UNKNOWN:
         return math.nan
@@ -375,7 +392,7 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     value = float(number[1].replace(",", "."))
     if value in NO_DATA:
         return math.nan
-    value *= behind.meters if behind.units else columns.altitude_unit
+    value *= behind.meters if behind.units else columns.altitude_unit or height_unit(columns.system)
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 
@@ -392,7 +409,8 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
     if not places:
         return []
     given = np.array(places)
-    given[:, :2] *= [in_units_of(columns.system or "", unit, file) for unit in columns.across_units]
+    across = [in_units_of(columns.system or "", unit, file) for unit in columns.across_units]
+    given *= [*across, 1 / height_unit(columns.system)]
     known = np.isfinite(given[:, 2])
     changed = change(np.where(np.isfinite(given), given, 0.0))
     changed[~known, 2] = math.nan

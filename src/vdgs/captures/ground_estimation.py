@@ -163,25 +163,17 @@ def _georef(
 def _georeferenced(scene: _Scene, georef: Georef, name: str, warnings: list[str]) -> GroundFrame:
     """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
     accuracy = f"; {georef.accuracy}" if georef.accuracy else ""
-    if georef.origin is None:
-        return GroundFrame(
-            scale=1.0,
-            rotation=np.eye(3),
-            translation=np.zeros(3),
-            metric=True,
-            description=f"world is metres, z up ({name}{accuracy})",
-            accuracy=georef.accuracy,
-            method=georef.method or f"{name}, which does not say how",
-        )
-    origin, how = georef.origin, f"world is ENU metres ({name}{accuracy})"
+    axes = "metres, z up" if georef.origin is None else "ENU metres"
     middle = np.median(scene.centers, axis=0)
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
-    if shift.any():
-        how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
+    moved = f", origin moved by {np.abs(shift).max():.0f} m" if shift.any() else ""
+    how = f"world is {axes} ({name}{accuracy}){moved}"
     frame = GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=origin,
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, description=how, origin_geo=georef.origin,
         accuracy=georef.accuracy, method=georef.method or f"{name}, which does not say how",
     )  # fmt: skip
+    if georef.origin is None:
+        return replace(frame, translation=shift)
     if np.linalg.norm(middle) > MAX_ENU_DISTANCE_M:
         warnings.append(
             f"{name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
@@ -226,7 +218,9 @@ def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
     """Similarity from camera centers to ENU, or None (with a warning) where the flight does not fix one."""
-    indices, geodetic, has_altitudes = match_gps(scene.names, file)
+    positions = match_gps(scene.names, file)
+    indices, geodetic, has_altitudes = positions.images, positions.geodetic, positions.has_altitudes
+    warnings += positions.notes
     origin = median_place(geodetic)
     enu = enu_from_geodetic(geodetic, origin)
     centers = scene.centers[indices]
@@ -257,8 +251,10 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
     axes = slice(3 if has_altitudes else 2)
     rms = float(np.sqrt((fit.residuals[inliers, axes] ** 2).sum(axis=1).mean()))
+    across, *up_m = fit.place_error_m
+    across = float(np.hypot(across, positions.datum_error_m))
     place = by_axis(
-        fit.place_error_m if has_altitudes else fit.place_error_m[:1],
+        (across, *up_m) if has_altitudes else (across,),
         ("across", "up"),
         lambda good: f"±{two_digits(good)}",
     )

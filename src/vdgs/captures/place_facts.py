@@ -19,7 +19,7 @@ from vdgs.captures.place_record import Bounds, PlaceFacts
 from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.captures.scene_points import MIN_SEEN_BY, ground_sampling_distance, scene_points
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.geometry.geodesy import geodetic_from_enu, wrap_degrees
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.visibility.visibility_counts import count_visibility
 
@@ -45,6 +45,8 @@ def measure_place(capture: Capture) -> PlaceFacts:
     latitudes, longitudes, crs_extent, crs_name, crs_unit = None, None, None, None, None
     if ground.origin_geo is not None:
         places = geodetic_from_enu(corners, ground.origin_geo, ground.axes_origin)[:, :2]
+        middle = ground.origin_geo[1]
+        places[:, 1] = middle + wrap_degrees(places[:, 1] - middle)  # beyond 180 degrees across the antimeridian
         (south, west), (north, east) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
         latitudes, longitudes = (south, north), (west, east)
         with contextlib.suppress(VdgsError):  # pyproj is not installed, or the zone does not reach

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vdgs.system.units import format_length
+from vdgs.system.units import format_length, three_digits
 
 #: From this many square metres on areas are in hectares, then in square kilometres.
 _HECTARE, _SQUARE_KILOMETER = 10_000.0, 1_000_000.0
@@ -77,13 +77,13 @@ def place_rows(facts: PlaceFacts, more_on_pixels: Sequence[tuple[str, str]] = ()
     ]
     if facts.extent is not None:
         x0, y0, x1, y1 = facts.extent
-        size = f"{x1 - x0:,.3g} × {y1 - y0:,.3g} {unit}"
+        size = f"{three_digits(x1 - x0)} × {three_digits(y1 - y0)} {unit}"
         rows.append(("Area", f"{format_area(facts.area, unit)} in at least two training photographs, within {size}"))
     if facts.ground_sampling_distance is not None:
         gsd = format_length(facts.ground_sampling_distance, unit)
         rows.append(("Pixel of the photographs", f"{gsd} on the ground ({facts.image_source}, as used)"))
     rows += more_on_pixels
-    rows.append(("Height of the cameras", f"{facts.height:.3g} {unit}"))
+    rows.append(("Height of the cameras", f"{three_digits(facts.height)} {unit}"))
     if unit == "m":
         rows.append(("Accuracy", facts.accuracy or "not stated by the capture"))
         rows += [("Placed by", facts.accuracy_method)] if facts.accuracy_method else []
@@ -103,11 +103,15 @@ def _where(facts: PlaceFacts) -> list[tuple[str, str]]:
 
 
 def _degrees(low: float, high: float, names: str) -> str:
+    """Two angles of an axis of which `names` are the sides, each with its own where these differ: longitudes run on
+    past 180 degrees."""
+    low, high = (value - 360 if value > 180 else value + 360 if value < -180 else value for value in (low, high))
+    if low >= 0 and high >= 0:
+        return f"{low:.5f}° to {high:.5f}° {names[0]}"
     if low < 0 and high <= 0:
-        low, high, side = -high, -low, names[1]
-    else:
-        side = names[0]
-    return f"{low:.5f}° to {high:.5f}° {side}"
+        return f"{-high:.5f}° to {-low:.5f}° {names[1]}"
+    sides = (f"{abs(value):.5f}° {names[value < 0]}" for value in (low, high))
+    return " to ".join(sides)
 
 
 def format_area(area: float | None, unit: str) -> str:
@@ -115,11 +119,10 @@ def format_area(area: float | None, unit: str) -> str:
     if area is None:
         return "unknown"
     if unit == "m" and area >= _SQUARE_KILOMETER:
-        return f"{area / _SQUARE_KILOMETER:.3g} km²"
+        return f"{three_digits(area / _SQUARE_KILOMETER)} km²"
     if unit == "m" and area >= _HECTARE:
-        return f"{area / _HECTARE:.3g} ha"
-    amount = f"{area:,.0f}" if area >= 100 else f"{area:.3g}"
-    return f"{amount} m²" if unit == "m" else f"{amount} square {unit}"
+        return f"{three_digits(area / _HECTARE)} ha"
+    return f"{three_digits(area)} m²" if unit == "m" else f"{three_digits(area)} square {unit}"
 
 
 def place_summary(facts: PlaceFacts) -> str:

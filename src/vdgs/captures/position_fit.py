@@ -20,9 +20,9 @@ from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_colli
 
 #: From so many on, east and north have a standard deviation each; of fewer they share one.
 ENOUGH_FOR_AXES = 20
-#: A position so many standard gps_std off is left out.
+#: A position so many standard deviations off is left out.
 LEFT_OUT_SIGMAS = 4.0
-#: Standard gps_std in metres, across and up, that few positions are taken to have beside what they show.
+#: Standard deviations in metres, across and up, that few positions are taken to have beside what they show.
 USUAL_M = (1.0, 2.0)
 #: Altitudes that drift, or that say nothing, must explain the flight better by so much (log likelihood; choice).
 DRIFT_COSTS, UNUSED_COSTS = 4.0, 8.0
@@ -34,7 +34,7 @@ UNUSED_TIMES = 1e5
 MOST_ALIKE = 0.95
 #: Positions wander where residuals differ by so many times more between photographs farther apart; of so many (choice).
 CHANCE, ENOUGH_TO_WANDER = 1.3, 15
-#: Rounds in which gps_std and outliers settle, and steps of Gauss and Newton in each.
+#: Rounds in which standard deviations and outliers settle, and steps of Gauss and Newton in each.
 ROUNDS, STEPS = 6, 6
 #: A fit is worse than nothing where scale (share), scale by what wanders alone, or north (degrees) may be farther off
 #: (95 %; choice).
@@ -107,7 +107,7 @@ class Problem:
     scale: tuple[float, float] | None = None
     """The factor from the cameras' world to metres, and its standard deviation as a share."""
     stated: np.ndarray | None = None
-    """Standard gps_std [n, 3] that the receiver itself states."""
+    """Standard deviations [n, 3] that the receiver itself states."""
     has_altitudes: bool = True
     """Whether the targets have heights; where not, heights are ignored and the fit is one in the plane."""
 
@@ -217,7 +217,7 @@ def _slope(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def _deviations(residuals: np.ndarray, model: str, stated: np.ndarray | None, robustly: bool = False) -> np.ndarray:
-    """Standard gps_std [3]: of many as they are, or robustly; of few joined with what positions usually are."""
+    """Standard deviations [3]: of many as they are, or robustly; of few joined with what positions usually are."""
     count, unknowns = len(residuals), np.array([2.0, 2.0, {"used": 3.0, "drifts": 4.0, "unused": 1.0}[model]])
     free = np.maximum(count - unknowns, 0.5)
     if count >= ENOUGH_TO_DOUBT:

@@ -228,6 +228,12 @@ def meters_of(word: str) -> float:
     return read_heading(word).meters
 
 
+def told_meters(word: str) -> float | None:
+    """The same of a heading that names a unit; None of one that names none."""
+    heading = read_heading(word)
+    return heading.meters if heading.units else None
+
+
 def number_of(word: str) -> float:
     """The number that a word says; NaN where it says none."""
     try:

@@ -16,7 +16,7 @@ import numpy as np
 from vdgs.captures.formats.brown_lens import brown_pinhole
 from vdgs.captures.formats.lens_projection import colmap_camera, ray_pixels
 from vdgs.captures.formats.source_capture import OWN_LENSES, Intrinsics
-from vdgs.captures.image_files import decode_image, decode_mask
+from vdgs.captures.image_files import decode_image, decode_mask, verify_image
 from vdgs.captures.name_resolution import jpeg_name
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes
@@ -120,6 +120,7 @@ def _undistort_one(
         stamp[kind] = status and [str(file), status.st_size, status.st_mtime_ns]
     known = read_json_or_empty(stamp_file)
     if not (target.is_file() and known.get("made_from") == stamp):
+        stamp_file.unlink(missing_ok=True)  # before: what is written is of this stamp only once all is
         keep = _write_straight(photo, map_of(lens), target, mask_target)
         write_bytes(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
         known = {"mask": keep}
@@ -129,7 +130,8 @@ def _undistort_one(
 
 def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_target: Path) -> bool:
     """Write the straightened image (`grid` as of `sampling_map`), and its mask if there is one (from a file or from
-    transparency)."""
+    transparency). Raises CaptureError for a damaged photograph, whose straightened copy would look sound."""
+    verify_image(photo.path)
     pixels, keep = decode_image(photo.path)
     if photo.mask is not None:
         masked = decode_mask(photo.mask, pixels.shape[1], pixels.shape[0])

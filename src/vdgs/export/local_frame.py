@@ -91,7 +91,7 @@ def _geodetic_at(
 
 def default_crs(ground: GroundFrame, path: Path) -> str | None:
     """The system that people expect of a file: point clouds for maps in map coordinates, the globe for 3D Tiles,
-    east, north and up (or local coordinates, without a georeference) for what is only looked at."""
-    if path.suffix.lower() in (".laz", ".las"):
+    east, north and up (or those of maps, without a georeference) for what is only looked at."""
+    if path.suffix.lower() in (".laz", ".las") or ground.origin_geo is None:
         return None
-    return "local" if ground.origin_geo is None else "enu"
+    return "enu"

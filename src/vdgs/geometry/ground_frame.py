@@ -35,6 +35,14 @@ class GroundFrame(Similarity):
         return self.axes_geo or self.origin_geo[:2]
 
     @property
+    def is_moved_site(self) -> bool:
+        """Whether the capture's own world is metres, z up, without a place on Earth, and was moved by whole metres, for
+        precision alone: people know the place by the coordinates of that world (of a site's grid)."""
+        shift, turned = self.translation, self.scale != 1 or not np.array_equal(self.rotation, np.eye(3))
+        moved = bool(shift.any()) and np.array_equal(shift, np.round(shift))
+        return self.metric and self.origin_geo is None and moved and not turned
+
+    @property
     def unit(self) -> str:
         """What one unit of the ground frame is called."""
         return "m" if self.metric else "units"

@@ -53,11 +53,12 @@ class MapProjection:
     def of(cls, ground: GroundFrame, crs: str | None = None) -> MapProjection:
         """The placement of a ground frame in the system that `crs` names (`CRS_CHOICES`).
 
-        None: the UTM zone of the origin where the frame is georeferenced, else "local", the ground frame itself.
+        None: the UTM zone of the origin where the frame is georeferenced, "source" where it is a site's that was moved,
+        else "local", the ground frame itself.
         Raises VdgsError for a system that is unknown, in degrees, not to the east and north, or needs a georeference
         that is not there, and where pyproj is not installed.
         """
-        name = (crs or ("local" if ground.origin_geo is None else utm_epsg(*ground.origin_geo[:2]))).strip()
+        name = (crs or _usual_name(ground)).strip()
         if name.lower() == "local":
             return _local(ground)
         if name.lower() == "source":
@@ -104,6 +105,12 @@ class MapProjection:
         if not np.isfinite(found).all():
             raise VdgsError(f"--crs {self.crs}: {self.name} does not reach this place. Give the system of its country.")
         return found
+
+
+def _usual_name(ground: GroundFrame) -> str:
+    if ground.origin_geo is not None:
+        return utm_epsg(*ground.origin_geo[:2])
+    return "source" if ground.is_moved_site else "local"
 
 
 def _local(ground: GroundFrame) -> MapProjection:

@@ -21,7 +21,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
 from vdgs.sfm.workspace import Workspace
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.atomic_files import read_json_or_empty, write_bytes, write_json
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -32,6 +32,11 @@ IMAGE_SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
 JPEG_QUALITY = 95
 #: The folder of masks, of the largest size.
 MASK_FOLDER = CaptureOptions.masks
+IMAGE_FOLDERS = (*(folder for folder, _ in IMAGE_SIZES), MASK_FOLDER)
+#: The lenses by which the written photographs lost their distortion.
+LENSES_FILE = "lenses.json"
+#: Lenses are compared at so many places across a picture and down.
+LENS_PLACES = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +61,52 @@ def make_undistortion(bent: Intrinsics, max_size: int) -> Undistortion:
     kept = width - width % SIDE_MULTIPLE, height - height % SIDE_MULTIPLE
     target = Intrinsics("PINHOLE", (fx * across, fy * up, cx * across, cy * up), *kept)
     return Undistortion(sampling_map(bent, pinhole), (width, height), target)
+
+
+def read_lenses(output: Path) -> dict[int, Intrinsics]:
+    """The lenses by which the photographs of a capture lost their distortion, by camera; none where that is unknown."""
+    try:
+        return {
+            int(number): Intrinsics(model, tuple(map(float, params)), int(width), int(height))
+            for number, (model, params, width, height) in read_json_or_empty(output / LENSES_FILE).items()
+        }
+    except (TypeError, ValueError):
+        return {}
+
+
+def write_lenses(output: Path, lenses: Mapping[int, Intrinsics]) -> None:
+    """Note the lenses by which photographs are about to lose their distortion."""
+    write_json(
+        output / LENSES_FILE,
+        {str(number): [lens.model, lens.params, lens.width, lens.height] for number, lens in lenses.items()},
+    )
+
+
+def lens_shift_px(before: Mapping[int, Intrinsics], after: Mapping[int, Intrinsics]) -> float:
+    """By how many pixels of a photograph, at most, pictures without distortion change from some lenses to others.
+
+    Infinite where there are other cameras, or the pictures have another size.
+    """
+    if before.keys() != after.keys():
+        return float("inf")
+    return max((_shift_px(before[number], lens) for number, lens in after.items()), default=0.0)
+
+
+def _shift_px(before: Intrinsics, after: Intrinsics) -> float:
+    if before == after:
+        return 0.0
+    old, new = undistorted_pinhole(before), undistorted_pinhole(after)
+    if (old.width, old.height) != (new.width, new.height):
+        return float("inf")
+    shown = [sampling_map(bent, _coarse(pinhole)) for bent, pinhole in ((before, old), (after, new))]
+    return float(np.linalg.norm(shown[0] - shown[1], axis=-1).max())
+
+
+def _coarse(pinhole: Intrinsics) -> Intrinsics:
+    """The camera of a picture of `LENS_PLACES` pixels across and down that shows the same."""
+    across, down = LENS_PLACES / pinhole.width, LENS_PLACES / pinhole.height
+    (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
+    return Intrinsics("PINHOLE", (fx * across, fy * down, cx * across, cy * down), LENS_PLACES, LENS_PLACES)
 
 
 def write_images(

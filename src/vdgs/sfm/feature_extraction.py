@@ -38,6 +38,8 @@ BYTES_PER_FEATURE = 160
 #: Photographs with fewer features cannot be matched.
 MIN_FEATURES = 100
 _UPRIGHT_QUALITY = 97
+#: What is said of photographs that COLMAP cannot read.
+UNDECODABLE = "cannot be decoded: copy it again"
 #: Their ends were looked at with their heads.
 _JPEGS = (".jpg", ".jpeg")
 
@@ -257,7 +259,7 @@ def images_without_features(photographs: Sequence[ImageMetadata], counts: dict[s
     for photo in photographs:
         count = counts.get(photo.name)
         if count is None:
-            found.append(ExcludedImage(photo.name, "cannot be decoded: copy it again"))
+            found.append(ExcludedImage(photo.name, UNDECODABLE))
         elif count < MIN_FEATURES:
             where = " where its mask is white" if photo.may_be_masked else ""
             found.append(ExcludedImage(photo.name, f"shows only {count} features{where}: blurred, dark, sky or water?"))

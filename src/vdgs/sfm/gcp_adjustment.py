@@ -85,15 +85,13 @@ def triangulate(model: pycolmap.Reconstruction, point: GroundControlPoint) -> Tr
     first = _nearest_to_marks(model, images, seen)
     if first is None:
         return None
-    kept, errors = seen, first[1]
+    kept, (place, errors) = seen, first
     while len(kept) > max(MIN_OBSERVATIONS + 1, len(seen) - len(seen) // 3) and errors.max() > MARK_WRONG_PX:
         fewer = [each for each, error in zip(kept, errors, strict=True) if error < errors.max()]
         found = _nearest_to_marks(model, images, fewer)
         if found is None:
             break
         kept, (place, errors) = fewer, found
-    else:
-        place = first[0] if kept is seen else place
     all_errors = _errors_px(model, images, seen, place)
     return TriangulatedPoint(
         place, len({each.image for each in seen}), _rms(all_errors), _rms(errors), tuple(kept)

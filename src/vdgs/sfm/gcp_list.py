@@ -12,10 +12,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.coordinate_systems import HEIGHTS_IN_METERS, datum_error, in_units_of, join_definition, to_geodetic
+from vdgs.captures.coordinate_systems import (
+    HEIGHTS_IN_METERS,
+    datum_error,
+    height_unit,
+    in_units_of,
+    join_definition,
+    to_geodetic,
+)
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
 from vdgs.captures.name_resolution import NameLookup, find_one
-from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, meters_of, number_of
+from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, meters_of, number_of, told_meters
 from vdgs.captures.text_tables import Line, rows_of, separator_of
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
@@ -109,15 +116,16 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     """The points of a gcp_list.txt: a first line with the coordinate system, then x y z px py photograph [name].
 
     Pixels are those of the file as it is, before EXIF's orientation, as ODM counts them. Points named in
-    `is_check_point` (`all`: every one) are check points. What photographs show that were left out is not used.
+    `check_points` (`all`: every one) are check points. What photographs show that were left out is not used.
 
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
     header, rows, (across, along, up) = _rows(file)
     transform, system = to_geodetic(header, file)
-    system = system if up == 1 else system.removesuffix(HEIGHTS_IN_METERS)
-    units = in_units_of(header, across, file), in_units_of(header, along, file), up
+    system = system if up in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
+    height = 1.0 if up is None else up / height_unit(header)
+    units = in_units_of(header, across, file), in_units_of(header, along, file), height
     lines = [_line(row, file, units) for row in rows]
     by_name = photographs_by_name(collection)
     lines, strange = _of_photographs(lines, by_name, file)
@@ -206,9 +214,9 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
         )
 
 
-def _rows(file: Path) -> tuple[str, list[Row], tuple[float, ...]]:
+def _rows(file: Path) -> tuple[str, list[Row], tuple[float, float, float | None]]:
     """The first line, and the words of the others, parted by blanks, or as in a CSV table; without names of columns, of
-    which the metres in one of x, y and z are given."""
+    which the metres in one of x, y and z are given: of z only where its name says a unit."""
     lines = [Line(*line) for line in text_lines(file, "control points")]
     if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
@@ -219,9 +227,10 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float, ...]]:
     if separator_of([line.text for line in lines]):
         rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
     if not rows or any(map(_is_number, rows[0].words[:5])):
-        return header.text, rows, (1.0, 1.0, 1.0)
+        return header.text, rows, (1.0, 1.0, None)
     _check_order(rows[0], file)
-    return header.text, rows[1:], tuple(map(meters_of, (rows[0].words + 3 * [""])[:3]))
+    x, y, z = (rows[0].words + 3 * [""])[:3]
+    return header.text, rows[1:], (meters_of(x), meters_of(y), told_meters(z))
 
 
 def _check_is_list(first: str, file: Path) -> None:

@@ -100,7 +100,7 @@ def georegister(
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
     up, notes = up_of(model, images_metadata)
     taken = [images_metadata[int(positions.image_indices[row])] for row in rows]
-    stated = stated or (all(photo.gps_std is not None for photo in taken) and positions.source == "EXIF")
+    stated = stated or (len(positions.are_stated) > 0 and bool(positions.are_stated[rows].all()))
     problem = Problem(
         centers=centers,
         targets=targets,

@@ -51,6 +51,8 @@ class GpsPriors:
     """[m, 3] float64."""
     gps_std: np.ndarray
     """Standard deviations [m, 3] in metres."""
+    are_stated: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    """Which of them [m] a receiver or a table states; empty where none is."""
     origin: tuple[float, float, float]
     """Latitude and longitude in degrees, altitude in metres."""
     altitude_reference: str
@@ -145,6 +147,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         image_indices=index,
         enu=enu,
         gps_std=deviations,
+        are_stated=np.array([_states_std(photographs[i], recorded.rows.get(i), table) for i in index.tolist()], bool),
         origin=origin,
         altitude_reference="; ".join(kinds),
         source=recorded.source,
@@ -311,8 +314,8 @@ def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:
 def _position_std(
     photo: ImageMetadata, row: GpsRow | None, table: Path | None, std_m: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """A table has its own columns of accuracy, else `deviation_m` across and upwards; photographs have what a
-    receiver with RTK says, or what EXIF says across and as much worse upwards as `deviation_m` is."""
+    """A table has its own columns of accuracy, else `std_m` across and upwards; photographs have what a
+    receiver with RTK says, or what EXIF says across and as much worse upwards as `std_m` is."""
     across, up = std_m
     if row is not None and row.gps_std is not None:
         across, up = (max(value, MIN_STD_M) for value in row.gps_std)
@@ -323,6 +326,10 @@ def _position_std(
         error = max(photo.gps_error_m, MIN_STD_M)
         return error, error, error * up / across
     return across, across, up
+
+
+def _states_std(photo: ImageMetadata, row: GpsRow | None, table: Path | None) -> bool:
+    return photo.gps_std is not None if table is None else row is not None and row.gps_std is not None
 
 
 def _some(names: Sequence[str], which: np.ndarray) -> str:

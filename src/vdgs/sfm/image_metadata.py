@@ -314,8 +314,8 @@ def _not_an_image(path: Path) -> str:
 
 
 def _is_panorama(found: ImageTags, xmp: Mapping[str, str]) -> bool:
-    """Whether a photograph shows all directions, equirectangular, by Google's XMP. Raises Unusable for panoramas of
-    other projections, and for parts."""
+    """Whether a photograph shows all directions, equirectangular, by Google's XMP. Raises UnusableImage for
+    panoramas of other projections, and for parts."""
     projection = text(xmp, "GPano:ProjectionType")
     if not projection:
         return False
@@ -348,7 +348,7 @@ def _check(found: ImageTags) -> None:
 
 
 def _check_pixels(path: Path) -> None:
-    """Raise Unusable unless all pixels of a JPEG without its end are there."""
+    """Raise UnusableImage unless all pixels of a JPEG without its end are there."""
     try:
         complete = lacks_only_end(path)
     except (OSError, SyntaxError, ValueError, MemoryError):

@@ -20,7 +20,7 @@ from rich.console import Console
 from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.lens_projection import colmap_camera, pixel_rays
 from vdgs.captures.formats.ply_reader import GRAY
-from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView, format_list
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
@@ -36,6 +36,8 @@ from vdgs.geometry.similarity import rotation_to_z
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, mask_files, pair_selection
+from vdgs.sfm.feature_extraction import UNDECODABLE
+from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.posed_photographs import (
     BENT,
     CAPTURE,
@@ -96,7 +98,8 @@ def make_posed_capture(
         _match(photographs, work, request, threads, console)
         model = _triangulate(photographs, work, threads, console)
         if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
-            for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse"):
+            finished.forget(CAPTURE)  # before: an interrupted removal is no finished capture
+            for name in (*capture_writer.IMAGE_FOLDERS, "sparse"):
                 shutil.rmtree(output / name, ignore_errors=True)
             for name in ("georef.json", TEST_LIST, VALIDATION_LIST):
                 (output / name).unlink(missing_ok=True)
@@ -141,15 +144,17 @@ def _find_features(
     images = [image for group in groups for image in group.images]
     feature_extraction.create_database(bent, groups)
     write_on_white(photographs, bent)
-    feature_extraction.write_upright_images(bent, images)
+    _refuse_damaged(feature_extraction.write_upright_images(bent, images))
     if not work.is_done(FEATURES, keys[FEATURES]):
         mask_files.write_upright_masks(bent, images, threads)
         there = feature_extraction.count_features(bent)
         with report_progress(work, console, "features", len(images)) as tell:
             feature_extraction.extract_groups(bent, groups, request.options, len(images), threads, there, tell)
         work.finish(FEATURES, keys[FEATURES])
+    counts = feature_extraction.count_features(bent)
+    _refuse_damaged([ExcludedImage(photo.name, UNDECODABLE) for photo in images if photo.name not in counts])
     if not photographs.is_data_set:  # objects without texture begin from random points
-        feature_extraction.images_without_features(images, feature_extraction.count_features(bent))
+        feature_extraction.images_without_features(images, counts)
     if work.is_done(BENT, keys[BENT]):
         return
     work.begin(BENT, keys[BENT])
@@ -158,6 +163,15 @@ def _find_features(
     shutil.copyfile(bent.database, work.database)
     _straighten(photographs, work)
     work.finish(BENT, keys[BENT])
+
+
+def _refuse_damaged(damaged: Sequence[ExcludedImage]) -> None:
+    """Raise CaptureError where photographs cannot be decoded: each has a pose, and is written in the end."""
+    if damaged:
+        raise CaptureError(
+            f"{len(damaged)} photographs of the project cannot be used; copy them again, or take them out of the "
+            f"project.{format_list([each.line for each in damaged])}"
+        )
 
 
 def _groups(photographs: PosedPhotographs) -> list[feature_extraction.CameraGroup]:

@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from vdgs.captures.formats.colmap_writing import write_model_files
+from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.reconstruction import (
     MAPPED,
@@ -53,10 +54,8 @@ from vdgs.sfm.reconstruction_plan import (
 )
 from vdgs.sfm.reconstruction_report import (
     ReconstructionResult,
-    cameras_of,
     check_enough_placed,
     exclusion_reasons,
-    lens_moved,
     make_reconstruction_report,
 )
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
@@ -68,7 +67,7 @@ from vdgs.system.file_locks import lock_folder
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.records import record_to_dict
 
-#: A lens that moves pixels in the corners by no more leaves the photographs without distortion as they are.
+#: A lens that moves pixels by no more leaves the photographs without distortion as they are.
 LENS_PX = 0.05
 
 
@@ -110,7 +109,7 @@ def reconstruct(
         with writing(request, run):
             sources.write(output)
             digests.write()
-            facts = _place_anew(prepared, before, keys["placed"], console)
+            facts = _place_anew(prepared, before, keys, console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
         print_reconstruction_report(facts, console)
         return facts
@@ -166,33 +165,34 @@ def _is_finished(output: Path, key: str) -> bool:
 
 
 def _placed_before(output: Path, key: str) -> ReconstructionReport | None:
-    """The facts of a finished capture of the same photographs that is to be placed otherwise."""
+    """The facts of a capture of the same photographs that was finished, and is to be placed otherwise."""
     if not (
         (output / RECONSTRUCTION_FILE).is_file()
         and (output / MAPPED).is_dir()
-        and Workspace(output).is_done("capture", key)
+        and Workspace(output).is_begun("capture", key)
     ):
         return None
     return read_reconstruction(output)
 
 
 def _place_anew(
-    prepared: ReconstructionPlan, before: ReconstructionReport, key: str, console: Console
+    prepared: ReconstructionPlan, before: ReconstructionReport, keys: dict[str, str], console: Console
 ) -> ReconstructionReport:
     """Place the model of a finished capture again; it stays as it is where that is refused. Photographs are written
-    again only where what places it tells another lens."""
+    again only where what places it tells another lens, and where that was interrupted."""
     began, collection = time.monotonic(), prepared.image_list
     output, photographs = prepared.request.output, collection.images
-    kinds = feature_extraction.group_by_camera(photographs)
+    kinds, finished = feature_extraction.group_by_camera(photographs), Workspace(output)
     found = georeference(pycolmap.Reconstruction(output / MAPPED), prepared, before.focal_fixed)
-    if lens_moved(before.cameras, cameras_of(found.model, kinds)) > LENS_PX:
+    if not finished.is_done("capture", keys["capture"]) or _lens_moved(output, found.model):
         work = Workspace(output / WORK_FOLDER)
         feature_extraction.write_upright_images(work, photographs)
         mask_files.write_upright_masks(work, photographs, prepared.threads)
-        for name in (*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER):
-            shutil.rmtree(output / name, ignore_errors=True)
+        finished.begin("placed", keys["placed"])
+        finished.begin("capture", keys["capture"])  # until all photographs are of this lens
+        shutil.rmtree(output / "sparse", ignore_errors=True)
         _write_images(prepared, work, found.model, console)
-        work.remove()
+        finished.finish("capture", keys["capture"])
     known = {each.name for each in collection.excluded}
     left_out = [
         ExcludedImage(photo.name, photo.excluded_reason)
@@ -210,7 +210,7 @@ def _place_anew(
         focal_fixed=held,
         seconds=seconds,
     )
-    return _finish(prepared, outcome, key)
+    return _finish(prepared, outcome, keys["placed"])
 
 
 def _steps(
@@ -260,8 +260,11 @@ def _finish(prepared: ReconstructionPlan, outcome: ReconstructionResult, key: st
     )
     if outcome.metric is not None:
         write_json(output / "georef.json", _georef(facts, outcome.found.origin))
-    lenses = _lenses(model, request.options.max_output_size)
-    capture_writer.write_model(output, model, {number: lens.intrinsics for number, lens in lenses.items()})
+    size = request.options.max_output_size
+    pinholes = {
+        number: capture_writer.make_undistortion(lens, size).intrinsics for number, lens in _lenses(model).items()
+    }
+    capture_writer.write_model(output, model, pinholes)
     write_json(
         output / RECONSTRUCTION_FILE,
         to_jsonable(record_to_dict(facts)) | {"options": to_jsonable(to_dict(request.options))},
@@ -364,10 +367,15 @@ def _gcp_positions(plan: ReconstructionPlan) -> np.ndarray:
     return plan.gcps.enu(plan.origin) if plan.gcps else np.zeros((0, 3))
 
 
-def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Undistortion]:
+def _lenses(model: pycolmap.Reconstruction) -> dict[int, Intrinsics]:
+    """The lenses of the cameras whose photographs are placed, by the numbers of the cameras."""
     used = sorted({image.camera_id for image in capture_writer.placed_images(model)})
-    lenses = {number: capture_writer.fitted_intrinsics(model.cameras[number]) for number in used}
-    return {number: capture_writer.make_undistortion(lens, max_size) for number, lens in lenses.items()}
+    return {number: capture_writer.fitted_intrinsics(model.cameras[number]) for number in used}
+
+
+def _lens_moved(output: Path, model: pycolmap.Reconstruction) -> bool:
+    """Whether photographs that are written lost their distortion by other lenses than those of the model."""
+    return capture_writer.lens_shift_px(capture_writer.read_lenses(output), _lenses(model)) > LENS_PX
 
 
 def _write(
@@ -381,8 +389,8 @@ def _write(
     """Photographs without distortion, by the lenses of the placed model, and the model as it was mapped."""
     output = plan.request.output
     if not Workspace(output).is_begun("capture", key):
-        folders = [*(folder for folder, _ in capture_writer.IMAGE_SIZES), capture_writer.MASK_FOLDER, "sparse", MAPPED]
-        for name in folders:
+        Workspace(output).forget("capture", "placed")  # before: an interrupted removal is no finished capture
+        for name in (*capture_writer.IMAGE_FOLDERS, "sparse", MAPPED):
             shutil.rmtree(output / name, ignore_errors=True)
         for name in (RECONSTRUCTION_FILE, "georef.json", RECONSTRUCTION_FIGURE):
             (output / name).unlink(missing_ok=True)
@@ -396,11 +404,18 @@ def _write(
 def _write_images(
     prepared: ReconstructionPlan, work: Workspace, model: pycolmap.Reconstruction, console: Console
 ) -> None:
+    """Photographs without distortion by the lenses of a model. Those that are there are kept, unless they were made by
+    other lenses."""
     output, max_size = prepared.request.output, prepared.request.options.max_output_size
+    if _lens_moved(output, model):
+        for name in capture_writer.IMAGE_FOLDERS:
+            shutil.rmtree(output / name, ignore_errors=True)
+        capture_writer.write_lenses(output, _lenses(model))
     names: dict[int, list[str]] = {}
     for image in sorted(capture_writer.placed_images(model), key=lambda image: image.name):
         names.setdefault(image.camera_id, []).append(image.name)
-    lenses, total = _lenses(model, max_size), sum(map(len, names.values()))
+    lenses = {number: capture_writer.make_undistortion(lens, max_size) for number, lens in _lenses(model).items()}
+    total = sum(map(len, names.values()))
     with report_progress(work, console, "writing", total, "without distortion, ") as tell:
         capture_writer.write_images(output, work, names, lenses, prepared.threads, tell)
 

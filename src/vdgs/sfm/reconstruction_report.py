@@ -180,19 +180,6 @@ def cameras_of(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> 
     )
 
 
-def lens_moved(before: Sequence[CameraReport], after: Sequence[CameraReport]) -> float:
-    """By how many pixels of a photograph the picture without distortion changes in the corners, at most."""
-    if len(before) != len(after):
-        return float("inf")
-    moved = [0.0]
-    for one, other in zip(before, after, strict=True):
-        corner = float(np.hypot(one.width, one.height)) / 2
-        away = corner / one.focal_after_px
-        bent = (other.radial_distortion - one.radial_distortion) * away**2
-        moved.append(corner * abs(bent + other.focal_after_px / one.focal_after_px - 1))
-    return max(moved)
-
-
 def _photographs(
     collection: ImageList, positions: GpsPriors, placed: Georegistration | None, left_out: Sequence[ExcludedImage]
 ) -> tuple[ImageReport, ...]:

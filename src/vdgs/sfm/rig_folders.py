@@ -118,7 +118,7 @@ def _distances(frames: Frames) -> tuple[np.ndarray, np.ndarray] | None:
     places = np.array([[(*(photo.lat_lon or ()), 0.0) for photo in frame] for frame in known])
     enu = enu_from_geodetic(places.reshape(-1, 3), tuple(places[0, 0])).reshape(-1, 2, 3)
     allowed = np.array([max(SAME_M, _SIGMAS * max(map(_stated_error, frame))) for frame in known])
-    seconds = enu[:, 1], np.roll(enu[:, 1], 1, axis=0)
+    seconds = enu[:, 1], np.roll(enu[:, 1], -1, axis=0)
     here, there = (np.linalg.norm(enu[:, 0] - second, axis=1) / allowed for second in seconds)
     return here, there
 

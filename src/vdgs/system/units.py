@@ -60,7 +60,12 @@ def format_length(value: float | None, unit: str) -> str:
     """A length for people: centimetres where metres would be small."""
     if value is None:
         return "unknown"
-    return f"{value * 100:.3g} cm" if unit == "m" and value < 1 else f"{value:.3g} {unit}"
+    return f"{three_digits(value * 100)} cm" if unit == "m" and value < 1 else f"{three_digits(value)} {unit}"
+
+
+def three_digits(value: float) -> str:
+    """0.123, 1.23, 12.3, 1,234: a measure that is good to three digits; whole from 100 on."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def two_digits(value: float, sign: str = "") -> str:

@@ -266,7 +266,7 @@ class ViewerScene:
     def map_projections(self) -> tuple[MapProjection, ...]:
         """The map coordinates that a point is given in beside those of the ground frame, if any."""
         with contextlib.suppress(VdgsError):  # pyproj is not installed
-            if self.capture.ground.origin_geo is not None:
+            if self.capture.ground.origin_geo is not None or self.capture.ground.is_moved_site:
                 return (MapProjection.of(self.capture.ground),)
         return ()
 
