@@ -492,5 +492,31 @@ def test_photographs_that_look_alike_find_each_other():
     rng = np.random.default_rng(0)
     kinds = rng.integers(0, 255, (2, 30, 128))
     looks = [(kinds[k % 2] + rng.normal(0, 3, (30, 128))).clip(0, 255).astype(np.uint8) for k in range(30)]
-    chosen = pair_selection.retrieval_pairs(looks, [0, 1])
+    chosen = pair_selection.retrieval_pairs(looks.__getitem__, len(looks), [0, 1])
     assert sum((i + j) % 2 == 0 for i, j in chosen) > 0.95 * len(chosen)
+
+
+def test_how_a_photograph_looks_does_not_depend_on_how_many_there_are(monkeypatch):
+    """Of each all descriptors count, however few the vocabulary is made of: a strip of which neighbors show a part."""
+    rng = np.random.default_rng(0)
+    ground = 512 * rng.dirichlet(np.full(128, 0.3), 2100)
+    strip = [
+        (ground[50 * k + rng.choice(400, 200, replace=False)] + rng.normal(0, 5, (200, 128))).clip(0, 255)
+        for k in range(35)
+    ]
+    strip[3] = np.zeros((0, 128))  # of one nothing is known
+    looks = [each.astype(np.uint8) for each in strip]
+
+    def overlapping() -> float:
+        chosen = pair_selection.retrieval_pairs(looks.__getitem__, len(looks), range(len(looks)))
+        assert chosen == pair_selection.retrieval_pairs(looks.__getitem__, len(looks), range(len(looks)))
+        assert not any(3 in pair for pair in chosen)
+        return float(np.mean([j - i < 8 for i, j in chosen]))
+
+    monkeypatch.setattr(pair_selection, "NUM_RETRIEVED", 5)
+    of_all = overlapping()
+    monkeypatch.setattr(pair_selection, "VOCABULARY_SAMPLE", 8 * len(looks))  # as of 5000 photographs
+    of_few = overlapping()
+    assert of_few > of_all - 0.1
+    assert of_all > 0.9
+    assert pair_selection.retrieval_pairs(lambda _: looks[3], 5, range(5)) == set()
