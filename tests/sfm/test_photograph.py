@@ -22,6 +22,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import pair_selection
+from vdgs.sfm.flights import flights_of, time_order
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
 from vdgs.sfm.georegistration import tilt_from_attitudes
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -486,6 +487,23 @@ def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doubli
 def test_near_ones_are_matched_and_those_without_a_place_are_not():
     places = np.array([[0, 0, 9], [1, 0, 5], [2, 0, 9], [90, 0, 9], [np.nan, 0, 0]])
     assert pair_selection.spatial_pairs(places, 1) == {(0, 1), (1, 2), (2, 3)}
+
+
+def test_photographs_follow_each_other_by_the_clock_and_without_one_as_they_are_counted(tmp_path):
+    """Frames of a film are often counted without zeros in front: frame10 follows frame9, in each folder on its own."""
+    one = replace(photograph(tmp_path, 0), datetime="")
+    names = [f"{folder}/frame{k}.jpg" for folder in ("part2", "part10") for k in range(1, 31)]
+    frames = [replace(one, name=name) for name in sorted(names)]
+    assert [frames[k].name for k in time_order(frames)] == names
+    chosen = pair_selection.sequential_pairs(time_order(frames), 1)
+    assert {frozenset(frames[k].name for k in pair) for pair in chosen} == {frozenset(pair) for pair in pairwise(names)}
+    second = replace(one, datetime="2026:06:23 16:31:59")
+    burst = [replace(second, name=f"{k}.jpg", subsecond=at) for k, at in ((1, 0.75), (2, 0.25), (3, 0.5))]
+    assert [burst[k].name for k in time_order(burst)] == ["2.jpg", "3.jpg", "1.jpg"]
+    climbing = [replace(one, name=f"f{k}.jpg") for k in range(30)]
+    heights = 9.0 * np.arange(30)
+    listed = sorted(range(30), key=lambda k: climbing[k].name)
+    assert not flights_of([climbing[k] for k in listed], altitudes=heights[listed]).any()  # no step
 
 
 def test_photographs_that_look_alike_find_each_other():

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm import pair_selection
+from vdgs.sfm.flights import time_order
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
@@ -107,10 +108,6 @@ def spatial_candidates(
     views = np.array([photo.attitude.camera_from_enu[2] if photo.attitude else unknown for photo in photographs])
     near = pair_selection.spatial_pairs(positions.all_positions(len(photographs)), options.num_neighbors, views)
     return near | pair_selection.sequential_pairs(time_order(photographs), pair_selection.SEQUENTIAL_OVERLAP_WITH_GPS)
-
-
-def time_order(photographs: Sequence[ImageMetadata]) -> list[int]:
-    return sorted(range(len(photographs)), key=lambda i: (photographs[i].datetime, photographs[i].name))
 
 
 def match_pairs(
