@@ -89,6 +89,18 @@ def test_transparency_stays_beside_a_profile(tmp_path):
     assert opaque[60:].all()
 
 
+@pytest.mark.parametrize("missing", [1, 2])
+def test_colors_become_srgb_where_a_file_lacks_its_end_marker(tmp_path, missing):
+    """As decoders themselves refuse it: what passes the check is decoded too."""
+    file = tmp_path / "a.jpg"
+    profile = matrix_profile("Display P3", *DISPLAY_P3)
+    Image.fromarray(patches(in_space(DISPLAY_P3))).save(file, quality=98, subsampling=0, icc_profile=profile)
+    expected = decode_image(file)[0]
+    file.write_bytes(file.read_bytes()[:-missing])
+    verify_image(file)
+    assert np.array_equal(decode_image(file)[0], expected)
+
+
 def test_cmyk_becomes_rgb(tmp_path):
     Image.fromarray(patches()).convert("CMYK").save(tmp_path / "print.jpg", quality=98, subsampling=0)
     assert read_header(tmp_path / "print.jpg").mode == "CMYK"
