@@ -22,10 +22,12 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line, status_json
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
+from vdgs.sfm import workspace
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruction_plan import check_output_folder
 from vdgs.sfm.run_request import make_sfm_request
 from vdgs.sfm.source_images import SourceImages, check_unchanged, source_changes
+from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_json
 from vdgs.system.content_digests import ContentDigests, find_copies
 
@@ -196,6 +198,22 @@ def test_masks_that_are_others_than_before_are_named(tmp_path, beside):
     if beside:  # records of before said nothing of these
         assert SourceImages.of([given], digests).changes_since(old) == ""
         assert before.changes_since(old) == old.changes_since(before) == ""
+
+
+def test_what_another_version_finished_stays_and_what_it_began_is_begun_anew(tmp_path, monkeypatch):
+    """After an upgrade a capture is as good as before, and parts that two versions made are not mixed."""
+    output = Workspace(tmp_path)
+    output.begin("capture", "key")
+    output.finish("capture", "key")
+    output.begin("placed", "key")
+    monkeypatch.setattr(workspace, "_VERSION", " by vdgs 99.0")
+    assert output.is_done("capture", "key")
+    assert not output.is_begun("placed", "key")
+    assert output.is_begun_by_any("placed", "key")
+    assert not output.is_begun_by_any("placed", "other")
+    assert not output.is_begun_by_any("model", "key")
+    output.begin("placed", "key")
+    assert output.is_begun("placed", "key")
 
 
 def test_a_run_of_another_capture_has_no_photographs(run, tmp_path):
