@@ -9,13 +9,15 @@ from PIL import Image
 from support.raw_writer import write_dng
 from vdgs.captures import optional_decoders
 from vdgs.captures.capture_dates import date_taken
-from vdgs.captures.color_profiles import ADOBE_RGB, DISPLAY_P3, matrix_profile
+from vdgs.captures.color_profiles import ADOBE_RGB, matrix_profile
 from vdgs.captures.image_files import decode_image, find_images, read_header, verify_image
 from vdgs.captures.image_tags import read_tags
 from vdgs.errors import CaptureError
 
 COLORS = np.array([[200, 100, 50], [60, 160, 90], [40, 70, 190], [128, 128, 128], [240, 240, 240], [30, 30, 30]])
 WIDE = 32
+#: Primaries x, y of red, green and blue, and about its exponent.
+DISPLAY_P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)), 2.2
 
 
 def patches(colors: np.ndarray = COLORS, height: int = 120) -> np.ndarray:

@@ -311,8 +311,8 @@ def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:
 def _position_std(
     photo: ImageMetadata, row: GpsRow | None, table: Path | None, std_m: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """A table has its own columns of accuracy, else `deviation_m` across and upwards; photographs have what a
-    receiver with RTK says, or what EXIF says across and as much worse upwards as `deviation_m` is."""
+    """A table has its own columns of accuracy, else `std_m` across and upwards; photographs have what a
+    receiver with RTK says, or what EXIF says across and as much worse upwards as `std_m` is."""
     across, up = std_m
     if row is not None and row.gps_std is not None:
         across, up = (max(value, MIN_STD_M) for value in row.gps_std)
