@@ -22,6 +22,8 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import pair_selection
+from vdgs.sfm.feature_extraction import create_database, group_by_camera
+from vdgs.sfm.feature_matching import select_pairs
 from vdgs.sfm.flights import flights_of, time_order
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
 from vdgs.sfm.georegistration import tilt_from_attitudes
@@ -37,6 +39,7 @@ from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
+from vdgs.sfm.workspace import Workspace
 from vdgs.sfm.xmp import first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -512,6 +515,34 @@ def test_photographs_that_look_alike_find_each_other():
     looks = [(kinds[k % 2] + rng.normal(0, 3, (30, 128))).clip(0, 255).astype(np.uint8) for k in range(30)]
     chosen = pair_selection.retrieval_pairs(looks.__getitem__, len(looks), [0, 1])
     assert sum((i + j) % 2 == 0 for i, j in chosen) > 0.95 * len(chosen)
+
+
+def test_without_positions_those_that_look_alike_are_matched_too(tmp_path):
+    """By the descriptors in the database; a panorama by those of all its views, each with each."""
+    rng = np.random.default_rng(0)
+    kinds, one = rng.integers(0, 255, (2, 300, 128)), replace(photograph(tmp_path / "card", 0, None), datetime="")
+    photographs = [replace(one, name=f"{k:03d}.jpg") for k in range(120)]
+    photographs += [replace(one, name=f"pano_{face}/120.jpg", face=face) for face in ("front", "right")]
+    work = Workspace(tmp_path / "work")
+    create_database(work, group_by_camera([one]))
+    with work.open_database() as database:
+        for k, photo in enumerate(photographs):
+            number = database.write_image(pycolmap.Image(name=photo.name, camera_id=1))
+            if k != 7:  # of this one nothing is known
+                looks = (kinds[k // 60 % 2] + rng.normal(0, 9, (300, 128))).clip(0, 255).astype(np.uint8)
+                kind = pycolmap.FeatureExtractorType.SIFT
+                database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, looks))
+    chosen = select_pairs(work, photographs, positions_of([one]), SfmOptions(exhaustive_max=20))
+    assert chosen == select_pairs(work, photographs, positions_of([one]), SfmOptions(exhaustive_max=20))
+    places = {photo.name: k for k, photo in enumerate(photographs)}
+    steps = {1, 2, 3, 4, 5, 6, 12, 24, 48, 96}
+    alike = [(places[a], places[b]) for a, b in chosen if places[b] - places[a] not in steps and places[b] < 120]
+    assert len(alike) > 300
+    assert np.mean([(i < 60) == (j < 60) for i, j in alike]) > 0.95
+    assert not any(7 in pair for pair in alike)
+    views = [{a for a, b in chosen if b == photo.name and places[a] < 120} for photo in photographs[-2:]]
+    assert views[0] == views[1]
+    assert sum(places[name] < 60 for name in views[0]) > 10
 
 
 def test_how_a_photograph_looks_does_not_depend_on_how_many_there_are(monkeypatch):
