@@ -6,6 +6,7 @@ import os
 import struct
 import subprocess
 import sys
+import warnings
 import zlib
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from support.commands import PATIENCE_SECONDS
-from vdgs.captures.image_files import decode_image
+from vdgs.captures.image_files import decode_image, pillow_without_limits
 from vdgs.errors import CaptureError
 from vdgs.system.native_messages import without_decoder_messages
 
@@ -79,3 +80,14 @@ def test_an_error_leaves_standard_error_as_it_was(capfd: pytest.CaptureFixture[s
         decode_image(tmp_path / "no.png")
     os.write(2, b"still here\n")
     assert capfd.readouterr().err.endswith("still here\n")
+
+
+def test_limits_of_pillow_return_once_the_last_thread_has_left():
+    """Photographs are opened in several threads, which leave in any order."""
+    before = Image.MAX_IMAGE_PIXELS, list(warnings.filters)
+    one, other = pillow_without_limits(), pillow_without_limits()
+    with one:
+        other.__enter__()
+    assert Image.MAX_IMAGE_PIXELS is None
+    other.__exit__(None, None, None)
+    assert (Image.MAX_IMAGE_PIXELS, list(warnings.filters)) == before

@@ -9,13 +9,15 @@ from PIL import Image
 from support.raw_writer import write_dng
 from vdgs.captures import optional_decoders
 from vdgs.captures.capture_dates import date_taken
-from vdgs.captures.color_profiles import ADOBE_RGB, DISPLAY_P3, matrix_profile
+from vdgs.captures.color_profiles import ADOBE_RGB, matrix_profile
 from vdgs.captures.image_files import decode_image, find_images, read_header, verify_image
 from vdgs.captures.image_tags import read_tags
 from vdgs.errors import CaptureError
 
 COLORS = np.array([[200, 100, 50], [60, 160, 90], [40, 70, 190], [128, 128, 128], [240, 240, 240], [30, 30, 30]])
 WIDE = 32
+#: Primaries x, y of red, green and blue, and about its exponent.
+DISPLAY_P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)), 2.2
 
 
 def patches(colors: np.ndarray = COLORS, height: int = 120) -> np.ndarray:
@@ -87,6 +89,18 @@ def test_transparency_stays_beside_a_profile(tmp_path):
     assert opaque is not None
     assert not opaque[:60].any()
     assert opaque[60:].all()
+
+
+@pytest.mark.parametrize("missing", [1, 2])
+def test_colors_become_srgb_where_a_file_lacks_its_end_marker(tmp_path, missing):
+    """As decoders themselves refuse it: what passes the check is decoded too."""
+    file = tmp_path / "a.jpg"
+    profile = matrix_profile("Display P3", *DISPLAY_P3)
+    Image.fromarray(patches(in_space(DISPLAY_P3))).save(file, quality=98, subsampling=0, icc_profile=profile)
+    expected = decode_image(file)[0]
+    file.write_bytes(file.read_bytes()[:-missing])
+    verify_image(file)
+    assert np.array_equal(decode_image(file)[0], expected)
 
 
 def test_cmyk_becomes_rgb(tmp_path):

@@ -16,7 +16,7 @@ from rich.console import Console
 from support.captures import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from support.commands import vdgs
 from vdgs.captures.formats.colmap_records import MAX_OBSERVATIONS
-from vdgs.captures.image_checks import END_BYTES, check_images, detect_rounding, find_copies
+from vdgs.captures.image_checks import check_images, detect_rounding
 from vdgs.captures.loading import load_capture
 from vdgs.captures.validation import require_valid, validate_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -295,14 +295,6 @@ def test_copies_of_a_photograph_under_other_names_are_told(folder, scene):
     assert len(told) == 1
     assert told[0].startswith("5 photographs are the same file as another one")
     assert f"({names[0]} = {names[3]} = {names[7]}, {names[1]} = {names[4]})" in told[0]
-
-
-def test_files_of_one_length_and_the_same_ends_are_no_copies(folder, scene):
-    """Pictures without compression all have one length, and often the same border."""
-    views = load_capture(folder).views[:3]
-    for view, middle in zip(views, (b"a", b"b", b"a"), strict=True):
-        view.image_path.write_bytes(bytes(END_BYTES) + middle + bytes(END_BYTES))
-    assert find_copies(views) == [(views[0].name, views[2].name)]
 
 
 def test_sizes_that_do_not_fit_the_rest(folder, scene):

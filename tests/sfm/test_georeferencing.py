@@ -424,7 +424,9 @@ def survey_looking_down(pitch_deg: float) -> tuple[SimpleNamespace, list[SimpleN
             cam_from_world=lambda pose=pose: SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: pose)),
         )  # fmt: skip
         recorded = attitude_from_gimbal(90.0 * (k % 2), pitch_deg, 0.0)
-        photographs.append(SimpleNamespace(name=str(k), attitude=recorded, face="", datetime="", gps_std=None))
+        photographs.append(
+            SimpleNamespace(name=str(k), attitude=recorded, face="", datetime="", subsecond=None, gps_std=None)
+        )
     points = {k: SimpleNamespace(xyz=turn @ each) for k, each in enumerate(rng.uniform(0, 80, (400, 3)) * [1, 1, 0.05])}
     positions = GpsPriors(
         enu=places - [40.0, 40, 60], gps_std=np.full((25, 3), 1.0), image_indices=np.arange(25),

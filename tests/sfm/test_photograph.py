@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +20,6 @@ from vdgs.captures.xmp_packets import MAX_XMP_BYTES
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
-from vdgs.sfm import pair_selection
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
 from vdgs.sfm.georegistration import tilt_from_attitudes
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -468,29 +466,3 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
     assert should_fix_focal(photographs, where, SfmOptions())[0] is held
     calibrated = [replace(photo, lens=Lens(0.7, CALIBRATED_SOURCE)) for photo in photographs]
     assert should_fix_focal(calibrated, where, SfmOptions())[0]
-
-
-# ----------------------------------------------------------------------------------------------------- pairs
-
-
-@given(st.integers(2, 40), st.integers(1, 8), st.integers(0, 4))
-def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doublings):
-    order = list(np.random.default_rng(count).permutation(count))
-    chosen = pair_selection.sequential_pairs(order, following, doublings) | pair_selection.spatial_pairs(
-        np.random.default_rng(0).random((count, 3)), 4
-    )
-    assert all(0 <= i < j < count for i, j in chosen)
-    assert {tuple(sorted(pair)) for pair in pairwise(order)} <= chosen
-
-
-def test_near_ones_are_matched_and_those_without_a_place_are_not():
-    places = np.array([[0, 0, 9], [1, 0, 5], [2, 0, 9], [90, 0, 9], [np.nan, 0, 0]])
-    assert pair_selection.spatial_pairs(places, 1) == {(0, 1), (1, 2), (2, 3)}
-
-
-def test_photographs_that_look_alike_find_each_other():
-    rng = np.random.default_rng(0)
-    kinds = rng.integers(0, 255, (2, 30, 128))
-    looks = [(kinds[k % 2] + rng.normal(0, 3, (30, 128))).clip(0, 255).astype(np.uint8) for k in range(30)]
-    chosen = pair_selection.retrieval_pairs(looks, [0, 1])
-    assert sum((i + j) % 2 == 0 for i, j in chosen) > 0.95 * len(chosen)

@@ -21,7 +21,7 @@ from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
-from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper
+from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, workspace
 from vdgs.sfm.reconstruct import reconstruct
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]
@@ -65,7 +65,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in found if path.suffix != ".JPG"}
 
 
-def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_path):
+def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_path, monkeypatch):
     shift = np.array([30.0, -20, 15])
     before = read_reconstruction(capture)
     facts, said = again(nine, capture, table(tmp_path / "gps.csv", nine, lambda enu: enu + shift))
@@ -81,6 +81,7 @@ def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_
         assert label in dict(report_rows(facts))
     written = json.loads((capture / "reconstruction.json").read_text())["accuracy"]
     assert written["scale_percent"] > 0
+    monkeypatch.setattr(workspace, "_VERSION", " by vdgs 99.0")  # after an upgrade
     assert "nothing to do" in again(nine, capture, tmp_path / "gps.csv")[1]
 
 

@@ -25,6 +25,7 @@ from vdgs.captures.formats.brown_lens import brown_intrinsics, unproject_pixels
 from vdgs.captures.formats.colmap import read_colmap
 from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView, WorldPrior
 from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import WORK_FOLDER
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.sfm_options import SfmRequest
@@ -33,11 +34,12 @@ from vdgs.geometry.geodesy import ecef_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
-from vdgs.sfm import feature_extraction, feature_matching, posed_capture
+from vdgs.sfm import feature_extraction, feature_matching, posed_capture, workspace
 from vdgs.sfm.posed_capture import make_posed_capture
-from vdgs.sfm.posed_photographs import _in_metres, read_posed_photographs
+from vdgs.sfm.posed_photographs import FEATURES, _in_metres, read_posed_photographs
 from vdgs.sfm.posed_plan import plan_posed_capture
 from vdgs.sfm.random_points import random_points
+from vdgs.sfm.workspace import Workspace
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]  # whole reconstructions, runs or trainings
 
@@ -223,7 +225,9 @@ def test_photographs_of_other_poses_are_refused(town_flight: tuple[Path, KnownFl
         ask(root, tmp_path / "capture")
 
 
-def test_a_look_refuses_an_output_that_the_work_refuses(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> None:
+def test_a_look_refuses_an_output_that_the_work_refuses(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root, flight = _some_photographs(town_flight, tmp_path)
     project_writers.write_realityscan_csv(root / "cameras.csv", flight)
     (tmp_path / "full").mkdir()
@@ -231,7 +235,16 @@ def test_a_look_refuses_an_output_that_the_work_refuses(town_flight: tuple[Path,
     with pytest.raises(VdgsError, match="holds other things"):
         plan_posed_capture(SfmRequest(image_folders=(root,), output=tmp_path / "full"), CaptureOptions())
     (tmp_path / "full/thesis.txt").rename(tmp_path / "full/digests.json")  # of a run that was killed at once
-    plan_posed_capture(SfmRequest(image_folders=(root,), output=tmp_path / "full"), CaptureOptions())
+    request = SfmRequest(image_folders=(root,), output=tmp_path / "full")
+    plan_posed_capture(request, CaptureOptions())
+    work = Workspace(request.output / WORK_FOLDER)
+    with monkeypatch.context() as before:
+        before.setattr(workspace, "_VERSION", " by vdgs 0.0")
+        work.begin(FEATURES, read_posed_photographs(request, CaptureOptions()).keys[FEATURES])
+    plan_posed_capture(request, CaptureOptions())  # of another version: begun anew
+    work.begin(FEATURES, "of other photographs")
+    with pytest.raises(VdgsError, match="begun with other photographs"):
+        plan_posed_capture(request, CaptureOptions())
 
 
 # ------------------------------------------------------------------------------------- data sets without points

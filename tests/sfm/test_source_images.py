@@ -8,6 +8,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from support.next_commands import next_commands
@@ -20,11 +22,14 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line, status_json
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
+from vdgs.sfm import workspace
+from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruction_plan import check_output_folder
 from vdgs.sfm.run_request import make_sfm_request
-from vdgs.sfm.source_images import SourceImages, check_unchanged
+from vdgs.sfm.source_images import SourceImages, check_unchanged, source_changes
+from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_json
-from vdgs.system.content_digests import ContentDigests
+from vdgs.system.content_digests import ContentDigests, find_copies
 
 
 @pytest.fixture
@@ -146,6 +151,69 @@ def test_a_file_is_read_again_only_where_its_size_or_time_is_another(card, tmp_p
     read.clear()
     assert len(ContentDigests.read(tmp_path / "other.json").of_all(files[:1] * 6)) == 1
     assert read.count(files[0]) == 1
+
+
+def test_files_of_one_length_and_the_same_ends_are_no_copies(tmp_path):
+    """Pictures without compression all have one length, and often the same border."""
+    files = [tmp_path / f"{k}.bmp" for k in range(5)]
+    for file, middle in zip(files, (b"a", b"b", b"a", b"a", b"ab"), strict=True):
+        file.write_bytes(bytes(1 << 20) + middle + bytes(1 << 20))
+    assert find_copies(files) == [[0, 2, 3]]
+    assert find_copies([]) == []
+    white = tmp_path / "renders"
+    white.mkdir()
+    for k in range(5):
+        picture = np.full((400, 400, 3), 255, np.uint8)
+        cv2.circle(picture, (100 + 50 * min(k, 3), 200), 60, (0, 90, 200), -1)
+        cv2.imwrite(str(white / f"{k}.bmp"), picture)
+    found = collect_images([white])
+    assert [photo.name for photo in found.images] == ["0.bmp", "1.bmp", "2.bmp", "3.bmp"]
+    assert [each.line for each in found.excluded] == ["4.bmp: is a copy of 3.bmp"]
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_masks_that_are_others_than_before_are_named(tmp_path, beside):
+    """Masks beside the given folder of photographs, and in it."""
+    card, output, digests = tmp_path / "card", tmp_path / "capture", ContentDigests(tmp_path / "digests.json")
+    given = card / "images" if beside else card
+    for k in range(3):
+        for folder in ("images", "masks"):
+            (card / folder).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(card / f"{folder}/{k}.png"), np.full((120, 160, 3), 50 * k, np.uint8))
+    before = SourceImages.of([given], digests)
+    before.write(output)
+    assert SourceImages.read(output) == before
+    assert source_changes(output) == ""
+    cv2.imwrite(str(card / "masks/1.png"), np.zeros((120, 160), np.uint8))
+    (card / "masks/2.png").unlink()
+    named = (
+        "photographs: 2 with another mask, or without (1.png, 2.png)"
+        if beside
+        else "photographs: 1 removed (masks/2.png), 1 changed (masks/1.png)"
+    )
+    assert source_changes(output) == named
+    with pytest.raises(VdgsError, match="begun with other photographs"):
+        check_unchanged(output, SourceImages.of([given], digests), overwrite=False)
+    old = replace(before, files=tuple(replace(each, mask=None) for each in before.files))
+    if beside:  # records of before said nothing of these
+        assert SourceImages.of([given], digests).changes_since(old) == ""
+        assert before.changes_since(old) == old.changes_since(before) == ""
+
+
+def test_what_another_version_finished_stays_and_what_it_began_is_begun_anew(tmp_path, monkeypatch):
+    """After an upgrade a capture is as good as before, and parts that two versions made are not mixed."""
+    output = Workspace(tmp_path)
+    output.begin("capture", "key")
+    output.finish("capture", "key")
+    output.begin("placed", "key")
+    monkeypatch.setattr(workspace, "_VERSION", " by vdgs 99.0")
+    assert output.is_done("capture", "key")
+    assert not output.is_begun("placed", "key")
+    assert output.is_begun_by_any("placed", "key")
+    assert not output.is_begun_by_any("placed", "other")
+    assert not output.is_begun_by_any("model", "key")
+    output.begin("placed", "key")
+    assert output.is_begun("placed", "key")
 
 
 def test_a_run_of_another_capture_has_no_photographs(run, tmp_path):

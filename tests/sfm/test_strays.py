@@ -463,7 +463,9 @@ def test_what_lacks_its_end_alone_is_used_with_a_note(tmp_path, kind, missing):
     assert lacks_only_end(file)
     assert not read_image_metadata(file, file.name).whole
     assert verify_image(file).has_content
+    shown = decode_image(file)[0]
     file.write_bytes(content)
+    assert np.array_equal(shown, decode_image(file)[0])
     assert read_image_metadata(file, file.name).whole
     file.write_bytes(content + b"\0" * 500)  # what makers put behind it
     assert read_image_metadata(file, file.name).whole

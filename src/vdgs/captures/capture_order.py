@@ -32,13 +32,13 @@ def flight_positions(names: Iterable[str]) -> dict[str, FlightPosition]:
     return {
         name: FlightPosition(flight, number)
         for flight, taken in flights.items()
-        for number, name in enumerate(sorted(taken, key=_natural))
+        for number, name in enumerate(sorted(taken, key=lambda name: (natural_key(PurePosixPath(name).name), name)))
     }
 
 
-def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
-    """A key to sort photographs of a flight by: digits count as the number that they are; those that are then equal by
+def natural_key(name: str) -> tuple[list[list[tuple[int, str]]], str]:
+    """A key to sort names by, folder by folder: digits count as the number that they are; those that are then equal by
     their letters."""
     # Text and digits take turns, text first: numbers stand at the same places of all names.
-    parts = re.split(r"([0-9]+)", PurePosixPath(name).name)
-    return [(int(part), "") if index % 2 else (0, part) for index, part in enumerate(parts)], name
+    split = [re.split(r"([0-9]+)", part) for part in PurePosixPath(name).parts]
+    return [[(int(text), "") if k % 2 else (0, text) for k, text in enumerate(part)] for part in split], name

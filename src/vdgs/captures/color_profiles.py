@@ -15,7 +15,6 @@ _SAME = 4
 _INTEROP_IFD, _ADOBE_RGB = 0xA005, "R03"
 #: Primaries x, y of red, green and blue, and the exponent.
 ADOBE_RGB = ((0.64, 0.33), (0.21, 0.71), (0.15, 0.06)), 563 / 256
-DISPLAY_P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)), 2.2
 _D65 = (0.3127, 0.3290)
 #: D50 in XYZ, which ICC profiles count from, and Bradford's matrix.
 _D50 = np.array([0.9642, 1.0, 0.8249])

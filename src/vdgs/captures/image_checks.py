@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,6 +13,7 @@ from vdgs.captures.capture import Capture, View, spread_evenly
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import kept_fraction, pillow_without_limits, verify_image
 from vdgs.errors import CaptureError
+from vdgs.system.content_digests import find_copies
 
 #: Rounding by this share of the distance between cameras and points is about a pixel (choice).
 MAX_ROUNDING_RATIO = 1e-3
@@ -46,8 +44,6 @@ def _step(values: np.ndarray, steps: list[float]) -> float:
 
 
 NUM_DECODER_THREADS = 2
-#: Bytes at each end of a file that tell it from others of its length.
-END_BYTES = 4096
 #: Masks that leave out more than this share of the photographs may be inverted.
 MAX_MASKED_FRACTION = 0.6
 
@@ -77,7 +73,7 @@ def check_images(
 ) -> ImageCheckReport:
     """Decode photographs and masks once.
 
-    `which` is "all" or the number of views to check, spread evenly. `progress(done, total)` is called
+    `sample` is "all" or the number of views to check, spread evenly. `on_progress(done, total)` is called
     after each view. Raises `CaptureError` that lists up to ten files that are truncated or damaged, or of which masks
     or transparency leave nothing, and where no photograph shows more than one color.
     """
@@ -101,7 +97,8 @@ def check_images(
     if len(blank) == len(checked):
         raise CaptureError(f"{folder}: every photograph is of one color only. Copy the photographs again.")
     masked = 1.0 - sum(view.kept for view in checked) / len(checked)
-    copies = find_copies([view for view in views if view.name not in set(blank)])
+    shown = [view for view in views if view.name not in set(blank)]
+    copies = [tuple(shown[k].name for k in group) for group in find_copies([view.image_path for view in shown])]
     return ImageCheckReport(files, masked, tuple(_warnings(blank, masked, copies)))
 
 
@@ -115,27 +112,6 @@ def _check_view(view: View) -> _CheckedView:
     except CaptureError as error:
         return _CheckedView(view.name, str(error))
     return _CheckedView(view.name, None, not photograph.has_content, kept)
-
-
-def find_copies(views: Sequence[View]) -> list[tuple[str, ...]]:
-    """The names of photographs whose files are the same byte for byte, each with its copies. Whole files are read only
-    where length and both ends agree."""
-    groups = [list(views)]
-    for part in (lambda path: path.stat().st_size, _ends, lambda path: hashlib.sha256(path.read_bytes()).digest()):
-        alike: dict[tuple[int, object], list[View]] = defaultdict(list)
-        for index, group in enumerate(groups):
-            for view in group:
-                alike[index, part(view.image_path)].append(view)
-        groups = [group for group in alike.values() if len(group) > 1]
-    return [tuple(view.name for view in group) for group in groups]
-
-
-def _ends(path: Path) -> bytes:
-    """The first and the last bytes of a file."""
-    with path.open("rb") as file:
-        first = file.read(END_BYTES)
-        file.seek(max(path.stat().st_size - END_BYTES, 0))
-        return first + file.read()
 
 
 def _warnings(blank: list[str], masked: float, copies: list[tuple[str, ...]]) -> list[str]:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import io
 import os
+import threading
 import warnings as python_warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -81,20 +82,41 @@ class ImageHeader:
     mode: str
 
 
+class _PillowLimits:
+    """The limits of Pillow in this process, and how many callers, in whatever threads, do without them."""
+
+    def __init__(self) -> None:
+        self._lock, self._callers, self._restore = threading.Lock(), 0, ExitStack()
+
+    def lift(self) -> None:
+        with self._lock:
+            self._callers += 1
+            if self._callers == 1:
+                self._restore.enter_context(python_warnings.catch_warnings())
+                python_warnings.simplefilter("ignore")
+                self._restore.callback(setattr, Image, "MAX_IMAGE_PIXELS", Image.MAX_IMAGE_PIXELS)
+                Image.MAX_IMAGE_PIXELS = None
+
+    def restore(self) -> None:
+        with self._lock:
+            self._callers -= 1
+            if not self._callers:
+                self._restore.close()
+
+
+_PILLOW_LIMITS = _PillowLimits()
+
+
 @contextmanager
 def pillow_without_limits() -> Iterator[None]:
     """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is judged
-    below).
-
-    Changes the whole process: enter it in one thread, around the work of others.
+    below), in the whole process until the last that entered it, in whatever thread, has left.
     """
-    with python_warnings.catch_warnings():
-        python_warnings.simplefilter("ignore")
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            yield
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
+    _PILLOW_LIMITS.lift()
+    try:
+        yield
+    finally:
+        _PILLOW_LIMITS.restore()
 
 
 @contextmanager
@@ -219,7 +241,11 @@ def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     if is_raw(path):
         return develop(path), None
-    pixels = _decode(path)
+    return _in_rgb(path, _decode(path))
+
+
+def _in_rgb(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """As `decode_image`, of a file's pixels as they are stored."""
     if pixels.dtype == np.uint16:
         if 0 < pixels.max() <= _DARK:
             raise CaptureError(
@@ -239,19 +265,21 @@ def decode_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
     """What a mask keeps (white), [height, width] bool; a mask of another size is resampled to the image's."""
-    keep = _mask(path)
+    return _resampled(_mask(path, _decode(path)), width, height)
+
+
+def _resampled(keep: np.ndarray, width: int, height: int) -> np.ndarray:
     if keep.shape == (height, width):
         return keep
     return cv2.resize(keep.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
 
-def _mask(path: Path) -> np.ndarray:
-    """What a mask keeps at its own size, [h, w] bool: of instant-ngp's what is black, of others what is bright and
-    opaque, of a photograph that was cut out all that is opaque."""
-    light = _lightness(path)
+def _mask(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """What a mask, decoded as it is stored, keeps at its own size, [h, w] bool: of instant-ngp's what is black, of
+    others what is bright and opaque, of a photograph that was cut out all that is opaque."""
+    light = _lightness(path, pixels)
     if path.name.lower().startswith(DYNAMIC_MASK):
         return light == 0
-    pixels = _decode(path)
     if pixels.ndim == 2 or pixels.shape[2] != 4:
         return _kept(light)
     half = MASK_THRESHOLD if pixels.max() <= 255 else MASK_THRESHOLD * 257
@@ -261,12 +289,11 @@ def _mask(path: Path) -> np.ndarray:
     return opaque if cut_out else _kept(light) & opaque
 
 
-def _lightness(mask: Path) -> np.ndarray:
+def _lightness(mask: Path, pixels: np.ndarray) -> np.ndarray:
     """The brightest channel of a mask at its own size, [h, w] uint8."""
-    pixels = _decode(mask)
     if pixels.dtype == np.uint16 and pixels.size and pixels.max() <= 255:  # 8 bits, written as 16
         return pixels.reshape(*pixels.shape[:2], -1)[..., :3].max(axis=2).astype(np.uint8)
-    return decode_image(mask)[0].max(axis=2)
+    return _in_rgb(mask, pixels)[0].max(axis=2)
 
 
 def _kept(light: np.ndarray) -> np.ndarray:
@@ -275,11 +302,23 @@ def _kept(light: np.ndarray) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray:
-    """OpenCV's decoding as stored (BGR order); Pillow where OpenCV cannot."""
+    """Pixels as stored (BGR order), of a JPEG that lacks nothing but its end marker too."""
     try:
-        data = without_orientation(np.fromfile(path, np.uint8))
+        data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    try:
+        return _decode_bytes(path, data)
+    except CaptureError:
+        with pillow_without_limits():
+            if not lacks_only_end(path):
+                raise
+    return _decode_bytes(path, np.frombuffer(with_end(path).getvalue(), np.uint8))
+
+
+def _decode_bytes(path: Path, data: np.ndarray) -> np.ndarray:
+    """OpenCV's decoding of a file's bytes; Pillow's where OpenCV cannot."""
+    data = without_orientation(data)
     converted = _converted(path, data)
     if converted is not None:
         return converted
@@ -370,14 +409,14 @@ def _extremes(image: Image.Image, band: str) -> tuple[float, float]:
     return image.getchannel(band).getextrema()  # type: ignore[return-value]
 
 
-def _why_nothing(mask: Path) -> str:
-    """Why a mask keeps nothing, and what to do."""
+def _why_nothing(mask: Path, pixels: np.ndarray) -> str:
+    """Why a mask of these pixels keeps nothing, and what to do."""
     if mask.name.lower().startswith(DYNAMIC_MASK):
         return f"Black is kept of masks that are named {DYNAMIC_MASK}..., and none of it is black. Turn it round"
-    pixels = _decode(mask)
-    if pixels.ndim == 3 and pixels.shape[2] == 4 and _kept(_lightness(mask)).any():
+    light = _lightness(mask, pixels)
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and _kept(light).any():
         return "It is transparent where it is white. Save it without transparency"
-    brightest = int(_lightness(mask).max())
+    brightest = int(light.max())
     hint = "Scale its values to 0 and 255" if brightest else "Turn it round if it is inverted"
     return f"White is kept, and the brightest value here is {brightest} of 255. {hint}"
 
@@ -390,13 +429,14 @@ def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool)
     opaque = decode_image(photograph)[1] if may_be_transparent else None
     keep = opaque
     if mask is not None:
-        kept = _mask(mask)
+        pixels = _decode(mask)
+        kept = _mask(mask, pixels)
         if not kept.any():
             raise CaptureError(
-                f"{mask}: leaves nothing of its photograph. {_why_nothing(mask)}, or remove the photograph from the "
-                "model."
+                f"{mask}: leaves nothing of its photograph. {_why_nothing(mask, pixels)}, or remove the photograph "
+                "from the model."
             )
-        keep = kept if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
+        keep = kept if opaque is None else _resampled(kept, *opaque.shape[::-1]) & opaque
     if keep is not None and not keep.any():
         raise CaptureError(
             f"{photograph}: is transparent everywhere that it is not masked; nothing of it is left. Remove its "

@@ -32,12 +32,13 @@ def has_end(path: Path, image: Image.Image) -> bool:
 
 
 def lacks_only_end(path: Path) -> bool:
-    """Whether a JPEG without an end has all its pixels: what would follow then changes none of them.
-
-    Raises what Pillow raises for files that it cannot decode.
-    """
+    """Whether a JPEG without an end has all its pixels: what would follow then changes none of them. False for files
+    that Pillow cannot decode as a JPEG."""
     data = _without_half(path.read_bytes())
-    one, other = (_pixels(data + filling + _END) for filling in _FILLINGS)
+    try:
+        one, other = (_pixels(data + filling + _END) for filling in _FILLINGS)
+    except (OSError, SyntaxError, ValueError):
+        return False
     return np.array_equal(one, other)
 
 

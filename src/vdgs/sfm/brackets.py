@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from vdgs.geometry.geodesy import enu_from_geodetic
-from vdgs.sfm.flights import time_of
+from vdgs.sfm.flights import time_key, time_of
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
 
@@ -32,7 +32,7 @@ Bracket = list[ImageMetadata]
 def unused_exposures(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], list[str]]:
     """The photographs of brackets that are not used, with the reason, and what people should know of them."""
     cameras: dict[tuple[str, tuple[int, int]], dict[str, Bracket]] = {}
-    for photo in sorted(photographs, key=lambda photo: (photo.datetime, PurePosixPath(photo.name).name, photo.name)):
+    for photo in sorted(photographs, key=time_key):
         folders = cameras.setdefault((photo.camera, photo.size), {})
         folders.setdefault(str(PurePosixPath(photo.name).parent), []).append(photo)
     left, used, sizes = dict[str, str](), list[str](), Counter[int]()
@@ -65,7 +65,7 @@ def _brackets(folders: dict[str, Bracket]) -> list[tuple[list[Bracket], bool]]:
     ]
     if len(folders) < LEAST or any(brackets for brackets, _ in found):
         return found
-    taken = sorted(chain(*folders.values()), key=lambda photo: (photo.datetime, PurePosixPath(photo.name).name))
+    taken = sorted(chain(*folders.values()), key=lambda photo: time_key(photo, across_folders=True))
     biases = [[_bias(photo) for photo in each] for each in folders.values()]
     steady = all(np.ptp(each) < SAME_STOPS for each in biases)  # false for NaN
     if steady and (brackets := _by_bias(taken)):

@@ -10,11 +10,13 @@ from rich.console import Console
 
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm import pair_selection
+from vdgs.sfm.flights import time_order
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_text
 from vdgs.system.lazy_pycolmap import pycolmap
+from vdgs.system.stop_signals import check_stop_requested
 
 #: Pairs that one call compares, for each thread.
 PAIRS_PER_THREAD = 12
@@ -60,12 +62,12 @@ def select_pairs(
         chosen = pair_selection.sequential_pairs(
             order, pair_selection.SEQUENTIAL_OVERLAP, pair_selection.QUADRATIC_OVERLAP
         )
-        chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, everyone, members), range(count))
+        chosen |= _alike(workspace, everyone, members, range(count))
     else:
         chosen = spatial_candidates(photographs, positions, options)
         lost = np.flatnonzero(~np.isfinite(positions.all_positions(count)).all(axis=1))
         if len(lost):
-            chosen |= pair_selection.retrieval_pairs(_descriptors(workspace, everyone, members), lost.tolist())
+            chosen |= _alike(workspace, everyone, members, lost.tolist())
             place = {i: k for k, i in enumerate(order)}
             chosen |= {
                 (min(i, j), max(i, j))
@@ -106,10 +108,6 @@ def spatial_candidates(
     views = np.array([photo.attitude.camera_from_enu[2] if photo.attitude else unknown for photo in photographs])
     near = pair_selection.spatial_pairs(positions.all_positions(len(photographs)), options.num_neighbors, views)
     return near | pair_selection.sequential_pairs(time_order(photographs), pair_selection.SEQUENTIAL_OVERLAP_WITH_GPS)
-
-
-def time_order(photographs: Sequence[ImageMetadata]) -> list[int]:
-    return sorted(range(len(photographs)), key=lambda i: (photographs[i].datetime, photographs[i].name))
 
 
 def match_pairs(
@@ -197,18 +195,24 @@ def delete_matches(workspace: Workspace) -> None:
         database.clear_two_view_geometries()
 
 
-def _descriptors(
-    workspace: Workspace, photographs: Sequence[ImageMetadata], members: Sequence[Sequence[int]]
-) -> list[np.ndarray]:
-    """Some descriptors [m, 128] of each photograph, or of all views of a panorama, the same in every run."""
+def _alike(
+    workspace: Workspace, photographs: Sequence[ImageMetadata], members: Sequence[Sequence[int]], queries: Sequence[int]
+) -> set[tuple[int, int]]:
+    """Pairs of `queries` with those that look alike, a panorama by all its views."""
     with workspace.open_database() as database:
         numbers = {image.name: image.image_id for image in database.read_all_images()}
-        found = []
-        for photo in photographs:
-            number = numbers.get(photo.name)
-            if number is None or not database.exists_descriptors(number):
-                found.append(np.zeros((0, 128), np.uint8))
-                continue
-            rows = np.asarray(database.read_descriptors(number).data)
-            found.append(rows[:: max(1, len(rows) // _MAX_DESCRIPTORS)].copy())
-        return [found[group[0]] if len(group) == 1 else np.concatenate([found[k] for k in group]) for group in members]
+
+        def descriptors_of(index: int) -> np.ndarray:
+            check_stop_requested()
+            found = (_descriptors(database, numbers.get(photographs[k].name)) for k in members[index])
+            return np.concatenate(list(found))
+
+        return pair_selection.retrieval_pairs(descriptors_of, len(members), queries)
+
+
+def _descriptors(database: pycolmap.Database, image: int | None) -> np.ndarray:
+    """Some descriptors [m, 128] of a photograph, the same in every run."""
+    if image is None or not database.exists_descriptors(image):
+        return np.zeros((0, 128), np.uint8)
+    rows = np.asarray(database.read_descriptors(image).data)
+    return rows[:: max(1, len(rows) // _MAX_DESCRIPTORS)].copy()

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
 from pathlib import PurePosixPath
+from typing import Any
 
 import numpy as np
 
+from vdgs.captures.capture_order import natural_key
 from vdgs.sfm.image_metadata import ImageMetadata
 
 #: A pause that is so long (seconds) and so many times the usual time between photographs parts flights (choice).
@@ -30,6 +32,19 @@ def time_of(text: str) -> datetime | None:
         return None
 
 
+def time_key(photo: ImageMetadata, across_folders: bool = False) -> tuple[str, float, Any]:
+    """A key to sort photographs by into the order in which they were taken: by the clock, then, as those without a
+    date, by their names as cameras count them, frame2 before frame10; of one folder after those of another, unless
+    photographs of one time were sorted into several folders."""
+    name = PurePosixPath(photo.name).name if across_folders else photo.name
+    return photo.datetime, photo.subsecond or 0.0, natural_key(name)
+
+
+def time_order(photographs: Sequence[ImageMetadata]) -> list[int]:
+    """The numbers of photographs in the order in which they were taken."""
+    return sorted(range(len(photographs)), key=lambda index: time_key(photographs[index]))
+
+
 def flights_of(
     photographs: Sequence[ImageMetadata],
     kinds: Sequence[Hashable] | None = None,
@@ -43,7 +58,7 @@ def flights_of(
         groups.setdefault((str(PurePosixPath(photo.name).parent), photo.camera, kind), []).append(index)
     labels, count = np.zeros(len(photographs), int), 0
     for members in groups.values():
-        members.sort(key=lambda index: (photographs[index].datetime, photographs[index].name))
+        members.sort(key=lambda index: time_key(photographs[index]))
         parts = _pauses([time_of(photographs[index].datetime) for index in members])
         if altitudes is not None:
             parts |= _steps(altitudes[members])

@@ -14,7 +14,7 @@ from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
-from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, untrusted_offsets
+from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -328,9 +328,8 @@ def _other_readings(targets: np.ndarray, origin: tuple[float, float, float]) -> 
 
 def _moments(taken: Sequence[ImageMetadata]) -> np.ndarray:
     """The order in which photographs were taken, from 0 to 1 [n]."""
-    order = sorted(range(len(taken)), key=lambda k: (taken[k].datetime, taken[k].name))
     moments = np.empty(len(taken))
-    moments[order] = np.linspace(0, 1, len(taken))
+    moments[time_order(taken)] = np.linspace(0, 1, len(taken))
     return moments
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from hashlib import blake2b
 from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
@@ -27,13 +25,12 @@ from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wi
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.rig_folders import with_sensors
 from vdgs.sfm.sidecars import with_sidecars
+from vdgs.system.content_digests import find_copies
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 
 #: Fewer photographs are no scene.
 MIN_IMAGES = 3
-#: So many bytes at both ends of files of one size tell whether they are copies.
-_DIGEST_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -206,20 +203,21 @@ def _drop_duplicates(photographs: list[ImageMetadata]) -> tuple[list[ImageMetada
     """Leave out copies of the same file, the same photograph with another ending, and names that differ in upper and
     lower case only."""
     kept, left_out = list[ImageMetadata](), list[ExcludedImage]()
-    sizes = Counter(photo.file_bytes for photo in photographs)
-    contents, stems = dict[tuple[int, bytes], str](), dict[str, list[ImageMetadata]]()
+    groups = find_copies([photo.path for photo in photographs])
+    group_of = {photographs[k].name: number for number, group in enumerate(groups) for k in group}
+    firsts, stems = dict[int, str](), dict[str, list[ImageMetadata]]()
     for photo in photographs:
-        content = (photo.file_bytes, _digest(photo.path)) if sizes[photo.file_bytes] > 1 else None
+        group = group_of.get(photo.name)
         alike = stems.setdefault(match_key(photo.name), [])
-        if content in contents:
-            why = f"is a copy of {contents[content]}"
+        if group in firsts:
+            why = f"is a copy of {firsts[group]}"
         else:
             why = next(filter(None, (_why_same(photo, other) for other in alike)), "")
         if why:
             left_out.append(ExcludedImage(photo.name, why))
             continue
-        if content is not None:
-            contents[content] = photo.name
+        if group is not None:
+            firsts[group] = photo.name
         alike.append(photo)
         kept.append(photo)
     return kept, left_out
@@ -235,10 +233,3 @@ def _why_same(photo: ImageMetadata, other: ImageMetadata) -> str:
         )
     one_mask = photo.mask is not None and photo.mask == other.mask  # which of the two is it of?
     return "" if taken_apart(photo, other) and not one_mask else f"has the name of {other.name} with another ending"
-
-
-def _digest(path: Path) -> bytes:
-    with path.open("rb") as file:
-        head = file.read(_DIGEST_BYTES)
-        file.seek(max(0, path.stat().st_size - _DIGEST_BYTES))
-        return blake2b(head + file.read()).digest()

@@ -351,7 +351,7 @@ def _check_pixels(path: Path) -> None:
     """Raise UnusableImage unless all pixels of a JPEG without its end are there."""
     try:
         complete = lacks_only_end(path)
-    except (OSError, SyntaxError, ValueError, MemoryError):
+    except (OSError, MemoryError):
         complete = False
     if not complete:
         raise UnusableImage("cannot be read (it is cut off): copy it again")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,6 @@ import numpy as np
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
-    from sklearn.cluster import MiniBatchKMeans
 
 #: Of those nearest in the plane, so many must be farther above or below than beside to be a facade's (choice).
 FACADE_SHARE = 0.75
@@ -27,8 +26,10 @@ SEQUENTIAL_OVERLAP_WITH_GPS = 2
 SEQUENTIAL_OVERLAP, QUADRATIC_OVERLAP = 6, 6
 #: Photographs that look alike, asked for each.
 NUM_RETRIEVED = 12
-#: Words of the vocabulary of looks, and descriptors that it is made of.
-VOCABULARY_SIZE, VOCABULARY_SAMPLE = 48, 40_000
+#: Words of the vocabulary of looks, and descriptors that it is made of, drawn from so many photographs.
+VOCABULARY_SIZE, VOCABULARY_SAMPLE, VOCABULARY_PHOTOGRAPHS = 48, 40_000, 400
+#: Photographs whose likeness to all others is held in memory at once.
+_LIKENESS_ROWS = 256
 
 
 def spatial_pairs(
@@ -36,7 +37,8 @@ def spatial_pairs(
 ) -> set[tuple[int, int]]:
     """Pairs of those nearest to each other in the plane, and of others where those show little of the same.
 
-    places [n, 3] in metres, NaN where unknown; views [n, 3], unit vectors of where the cameras look, NaN where unknown.
+    `positions` [n, 3] in metres, NaN where unknown; `directions` [n, 3], unit vectors of where the cameras look, NaN
+    where unknown.
     More are asked for, the nearest first, where most of those nearest in the plane are farther above or below than
     beside (a facade: then the nearest in space), where most of them look another way (then those that look the same
     way), and where several that may look the same way share a place (then `SHARED_NEIGHBOR_FACTOR` as many).
@@ -92,40 +94,54 @@ def exhaustive_pairs(count: int) -> set[tuple[int, int]]:
     return set(combinations(range(count), 2))
 
 
-def retrieval_pairs(descriptors: Sequence[np.ndarray], queries: Sequence[int]) -> set[tuple[int, int]]:
-    """Pairs of the photographs `asking` with those whose features look most alike; descriptors [m, 128] of each.
+def retrieval_pairs(
+    descriptors_of: Callable[[int], np.ndarray], count: int, queries: Sequence[int]
+) -> set[tuple[int, int]]:
+    """Pairs of the photographs `queries` with those of all `count` whose features look most alike.
 
-    Features are counted by their nearest word and summed as differences from it (VLAD, Jégou et al. 2010).
+    `descriptors_of` reads the descriptors [m, 128] of a photograph, of one at a time: all are too many for memory. They
+    are counted by their nearest word and summed as differences from it (VLAD, Jégou et al. 2010).
     """
-    from sklearn.cluster import MiniBatchKMeans  # here: the look before the work does without these seconds
-
-    usable = [i for i, each in enumerate(descriptors) if len(each)]
-    if len(usable) < 2:
-        return set()
-    rng = np.random.default_rng(0)
-    share = max(1, VOCABULARY_SAMPLE // len(usable))
-    drawn = [descriptors[i][rng.permutation(len(descriptors[i]))[:share]] for i in usable]
-    sample = np.concatenate(drawn).astype(np.float32)
-    words = MiniBatchKMeans(min(VOCABULARY_SIZE, len(sample)), random_state=0, n_init=1).fit(sample)
-    looks = np.stack([_vlad_descriptor(part.astype(np.float32), words) for part in drawn])
-    likeness = looks @ looks.T
-    np.fill_diagonal(likeness, -np.inf)
+    words = _vocabulary(descriptors_of, count)
+    looks = np.zeros((count, words.size), np.float32)
+    for i in range(count) if len(words) else ():
+        looks[i] = _vlad_descriptor(descriptors_of(i).astype(np.float32), words)
+    known = np.flatnonzero(looks.any(axis=1))
+    asking = np.intersect1d(queries, known)
     pairs = set()
-    for i in queries:
-        if i in usable:
-            row = likeness[usable.index(i)]
-            pairs |= {
-                _pair(i, usable[int(j)]) for j in np.argsort(-row, kind="stable")[: min(NUM_RETRIEVED, len(usable) - 1)]
-            }
+    for start in range(0, len(asking), _LIKENESS_ROWS):
+        rows = asking[start : start + _LIKENESS_ROWS]
+        likeness = looks[rows] @ looks[known].T
+        likeness[rows[:, None] == known] = -np.inf
+        nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : min(NUM_RETRIEVED, len(known) - 1)]
+        pairs |= {_pair(int(i), int(j)) for i, row in zip(rows, known[nearest], strict=True) for j in row}
     return pairs
 
 
-def _vlad_descriptor(features: np.ndarray, words: MiniBatchKMeans) -> np.ndarray:
-    centers, nearest = words.cluster_centers_, words.predict(features)
-    sums = np.zeros_like(centers, dtype=np.float64)
-    np.add.at(sums, nearest, features - centers[nearest])
-    sums = np.sign(sums) * np.sqrt(np.abs(sums))
-    flat = sums.ravel()
+def _vocabulary(descriptors_of: Callable[[int], np.ndarray], count: int) -> np.ndarray:
+    """Words [k, 128] of some descriptors of some photographs, the same in every run; none where there are none."""
+    from sklearn.cluster import MiniBatchKMeans  # here: the look before the work does without these seconds
+
+    rng = np.random.default_rng(0)
+    chosen = np.sort(rng.permutation(count)[:VOCABULARY_PHOTOGRAPHS])
+    share = -(-VOCABULARY_SAMPLE // max(1, len(chosen)))
+    drawn = [np.zeros((0, 128), np.uint8)]
+    for i in chosen.tolist():
+        descriptors = descriptors_of(i)
+        drawn.append(descriptors[rng.permutation(len(descriptors))[:share]])
+    sample = np.concatenate(drawn).astype(np.float32)
+    if not len(sample):
+        return sample
+    words = MiniBatchKMeans(min(VOCABULARY_SIZE, len(sample)), random_state=0, n_init=1).fit(sample)
+    return np.asarray(words.cluster_centers_, np.float32)
+
+
+def _vlad_descriptor(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """How a photograph looks [k * 128], a unit vector; 0 without descriptors."""
+    nearest = np.argmin((words**2).sum(axis=1) - 2 * descriptors @ words.T, axis=1)
+    of_word = (nearest == np.arange(len(words))[:, None]).astype(np.float32)
+    sums = of_word @ descriptors - of_word.sum(axis=1, keepdims=True) * words
+    flat = (np.sign(sums) * np.sqrt(np.abs(sums))).ravel()
     return flat / max(float(np.linalg.norm(flat)), 1e-12)
 
 

@@ -121,7 +121,7 @@ def check_posed_output(photographs: PosedPhotographs) -> None:
     if not begun:
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
     keys = photographs.keys
-    same = work.is_begun(FEATURES, keys[FEATURES]) or finished.is_begun(CAPTURE, keys[CAPTURE])
+    same = work.is_begun_by_any(FEATURES, keys[FEATURES]) or finished.is_begun_by_any(CAPTURE, keys[CAPTURE])
     if not same and not request.overwrite:
         raise VdgsError(
             f"{output}: was begun with other photographs, poses or settings than there are now. Add --overwrite to "

@@ -11,7 +11,7 @@ from datetime import timedelta
 import numpy as np
 from shapely import MultiPoint
 
-from vdgs.sfm.flights import time_of
+from vdgs.sfm.flights import time_of, time_order
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -116,13 +116,9 @@ def _overlap(
     """Along the flight, if the shorter side points forwards: from the steps between photographs in order of time."""
     if footprint is None or len(positions) < 3:
         return None
-    order = sorted(range(len(positions)), key=lambda row: _time_key(photographs[int(positions.image_indices[row])]))
+    order = time_order([photographs[index] for index in positions.image_indices.tolist()])
     steps = np.linalg.norm(np.diff(positions.enu[order, :2], axis=0), axis=1)
     return float(np.clip(1 - np.median(steps) / footprint[1], 0, 1))
-
-
-def _time_key(photo: ImageMetadata) -> tuple[str, str]:
-    return photo.datetime, photo.name
 
 
 def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None) -> float | None:
@@ -184,9 +180,10 @@ def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:
     kinds: dict[tuple[str, int, str], list[ImageMetadata]] = {}
     for photo in photographs:
         kinds.setdefault((photo.camera, photo.width * photo.height, photo.path.suffix.lower()), []).append(photo)
+    medians = {kind: statistics.median(photo.file_bytes for photo in alike) for kind, alike in kinds.items()}
     return [
         photo.name
-        for alike in kinds.values()
+        for kind, alike in kinds.items()
         for photo in alike
-        if photo.file_bytes < SMALL_FILE_RATIO * statistics.median(each.file_bytes for each in alike)
+        if photo.file_bytes < SMALL_FILE_RATIO * medians[kind]
     ]

@@ -22,7 +22,7 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
 from vdgs.kernels import default_num_threads
-from vdgs.sfm import feature_matching, incremental_mapper
+from vdgs.sfm import feature_matching, flights, incremental_mapper
 from vdgs.sfm.console_report import print_preflight
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors, read_gps_priors
@@ -215,7 +215,4 @@ def check_disk_space(plan: ReconstructionPlan) -> None:
 
 def time_order(plan: ReconstructionPlan) -> list[int]:
     """Rows of the positions in the order in which the photographs were taken."""
-    photographs, index = plan.image_list.images, plan.gps_priors.image_indices
-    return sorted(
-        range(len(index)), key=lambda row: (photographs[int(index[row])].datetime, photographs[int(index[row])].name)
-    )
+    return flights.time_order([plan.image_list.images[index] for index in plan.gps_priors.image_indices.tolist()])

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.sfm import feature_extraction, feature_matching, mask_files
+from vdgs.sfm.flights import time_order
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.pair_selection import SEQUENTIAL_OVERLAP
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -149,7 +150,7 @@ def _probed_photographs(plan: ReconstructionPlan) -> list[ImageMetadata]:
     """A photograph from the middle of the flight, and a near and a far one of those that it is matched with: how long a
     pair takes to be verified depends on how much the two overlap."""
     photographs = plan.image_list.images
-    order = feature_matching.time_order(photographs)
+    order = time_order(photographs)
     first = order[len(order) // 2]
     if plan.gps_priors.usable:
         places = plan.gps_priors.all_positions(len(photographs))

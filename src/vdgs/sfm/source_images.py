@@ -20,6 +20,8 @@ class SourceFile:
 
     name: str
     digest: str = ""
+    mask: str | None = None
+    """The digest of its mask where that lies beside the folders, empty where there is none; None: not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +35,21 @@ class SourceImages:
     @staticmethod
     def of(folders: Sequence[Path], digests: ContentDigests, command: str | None = None) -> SourceImages:
         """Those that lie in the folders now. Raises VdgsError where they cannot be told."""
-        from vdgs.sfm.find_images import find_files  # reads pictures, which most runs do not need
+        from vdgs.sfm.find_images import find_files  # these read pictures, which most runs do not need
+        from vdgs.sfm.mask_files import find_masks
 
         named = find_files(folders).named
-        found = digests.of_all(named.values())
-        files = tuple(SourceFile(name, found[path]) for name, path in named.items())
+        within = {path.resolve() for path in named.values()}  # masks among these are files of their own
+        masks = {
+            path: mask
+            for path, mask in find_masks(folders, named.values())[0].items()
+            if mask is not None and mask.resolve() not in within
+        }
+        found = digests.of_all([*named.values(), *masks.values()])
+        files = tuple(
+            SourceFile(name, found[path], (found[masks[path]] or None) if path in masks else "")
+            for name, path in named.items()
+        )
         return SourceImages(folders=tuple(str(each.resolve()) for each in folders), files=files, command=command)
 
     @staticmethod
@@ -52,11 +64,16 @@ class SourceImages:
         write_json(output / SOURCE_IMAGES_FILE, record_to_dict(self))
 
     def changes_since(self, before: SourceImages) -> str:
-        """2 photographs added (a.jpg, b.jpg), 1 removed (c.jpg); empty where nothing changed."""
+        """2 photographs added (a.jpg, b.jpg), 1 removed (c.jpg), 1 with another mask (d.jpg); empty where nothing
+        changed."""
         old, new = ({each.name: each for each in files} for files in (before.files, self.files))
-        pairs = {name: (old[name].digest, new[name].digest) for name in old.keys() & new.keys()}
-        changed = [name for name, (before_it, now) in pairs.items() if before_it and now and before_it != now]
-        kinds = (("added", new.keys() - old.keys()), ("removed", old.keys() - new.keys()), ("changed", changed))
+        both = [(old[name], new[name]) for name in old.keys() & new.keys()]
+        changed = [now.name for was, now in both if was.digest and now.digest and was.digest != now.digest]
+        masked = [now.name for was, now in both if None not in (was.mask, now.mask) and was.mask != now.mask]
+        kinds = (
+            ("added", new.keys() - old.keys()), ("removed", old.keys() - new.keys()), ("changed", changed),
+            ("with another mask, or without", masked),
+        )  # fmt: skip
         parts = [f"{len(names)} {kind} ({first_names(sorted(names))})" for kind, names in kinds if names]
         return f"photographs: {', '.join(parts)}" if parts else ""
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from vdgs import __version__
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_metadata import RADIAL
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import cache_key
 from vdgs.system.content_digests import ContentDigests
 from vdgs.system.records import record_to_dict
+
+#: Of finished captures, which stay good in later versions: another one only where these must be made anew.
+FORMAT = "0.1.0"
 
 
 def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, str]:
@@ -26,7 +28,7 @@ def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, st
     ]
     lenses = [photo.lens and photo.lens.focal for photo in plan.image_list.images]
     found = cache_key(
-        __version__, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan, digests),
+        FORMAT, files, lenses, options.max_image_size, options.max_num_features, *_masked_images(plan, digests),
         *_other_cameras(plan),
     )  # fmt: skip
     matched = cache_key(found, options.num_neighbors, options.exhaustive_max)

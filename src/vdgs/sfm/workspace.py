@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 from rich.console import Console
 
+from vdgs import __version__
 from vdgs.captures.reconstruction import PROGRESS_FILE, SFM_STAGE, STEPS_FILE
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.system.atomic_files import is_disk_full, read_json_or_empty, write_json
@@ -35,6 +36,9 @@ _UNITS = {"frames": "seconds", "matching": "pairs"}
 _POLL_SECONDS = 0.2
 #: Work that takes fewer seconds needs no lines about how far it is.
 _MIN_LOG_SECONDS = 30.0
+#: What stands behind the key of a step that was begun.
+_BY = " by vdgs "
+_VERSION = f"{_BY}{__version__}"
 
 
 @dataclass(frozen=True)
@@ -91,14 +95,20 @@ class Workspace:
         return self.path / "kept"
 
     def is_done(self, step: str, key: str) -> bool:
+        """Whether a step is finished for these photographs and settings, by whatever version of vdgs."""
         return self._steps("done").get(step) == key
 
     def is_begun(self, step: str, key: str) -> bool:
-        """Whether what there is of a step was made for these photographs and settings."""
-        return self._steps("begun").get(step) == key
+        """Whether what there is of a step was made for these photographs and settings, by this version: parts that two
+        versions made are not mixed."""
+        return self._steps("begun").get(step) == f"{key}{_VERSION}"
+
+    def is_begun_by_any(self, step: str, key: str) -> bool:
+        """The same by whatever version."""
+        return self._steps("begun").get(step, "").partition(_BY)[0] == key
 
     def begin(self, step: str, key: str) -> None:
-        self._note("begun", step, key)
+        self._note("begun", step, f"{key}{_VERSION}")
 
     def finish(self, step: str, key: str) -> None:
         self._note("done", step, key)

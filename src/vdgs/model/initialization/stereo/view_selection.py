@@ -34,7 +34,7 @@ def select_source_views(
     cameras: Sequence[Camera], points: Float[np.ndarray, "n 3"], count: int = NUM_SOURCE_VIEWS
 ) -> list[list[int]]:
     """For each camera up to `count` others that see places of its picture from elsewhere, best first; none for one that
-    shows hardly any. `places` are those of the whole flight, roughly. Deterministic."""
+    shows hardly any. `points` are those of the whole flight, roughly. Deterministic."""
     views = count_visibility(torch.from_numpy(points), cameras).numpy()
     groups = SpatialGroups.of(torch.from_numpy(points))
     shown = [_sample_points(points_in_view(camera, points, groups), views) for camera in cameras]
