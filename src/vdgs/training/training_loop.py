@@ -98,7 +98,9 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     background, with_pseudo_view = background_at(stage, iteration), is_pseudo_view_due(config, iteration)
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
-        target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
+        if not with_pseudo_view:  # which begins at any place of the box, on any device
+            box = crop_to_gradient_support(stage, splats, camera, box)
+        target = make_target(stage, view, downscale, box)
         frozen = _frozen_splats(stage, view, camera, target.camera, iteration)
         drawn = render_for_training(
             splats, target.camera, background, frozen, depth=with_pseudo_view or is_agreement_due(config, iteration),
