@@ -86,8 +86,8 @@ def warp_photograph(
     target: TrainingTarget, shown: Raster, camera: Camera, raster: Raster, camera_height: float
 ) -> TrainingTarget | None:
     """What a pseudo view, drawn as `raster`, should show by a photograph whose view was drawn as `shown`, both with
-    depth; None where the photograph sees too little of it. Of a part of a photograph gradients are multiplied by its share
-    of the area: a pixel of a pseudo view weighs the same, whether it lies near a part or near the whole."""
+    depth; None where the photograph sees too little of it. Near a part of a photograph, gradients are multiplied by the
+    part's share of the area: a pixel of a pseudo view weighs as much as near the whole."""
     assert raster.median_depth is not None
     assert shown.median_depth is not None
     depth = raster.median_depth
