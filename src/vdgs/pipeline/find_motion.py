@@ -39,6 +39,7 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import write_array, write_bytes, write_json
 from vdgs.system.console import show_share
 from vdgs.system.documents import JsonObject
+from vdgs.visibility.visibility_counts import NearbyCameras
 
 #: Photographs that the picture for people shows, those of which most moves, and the width of each.
 EXAMPLES, EXAMPLE_WIDTH_PX = 6, 480
@@ -109,7 +110,8 @@ class _MotionSearch:
 
     def share_of(self, views: Sequence[View]) -> float:
         """The mean share of the photographs' pixels that moves; writes their masks."""
-        known, cameras = self._opened.capture.train_views, [view.camera for view in self._opened.capture.train_views]
+        known = self._opened.capture.train_views
+        cameras = NearbyCameras([view.camera for view in known])
         names = {view.name for view in views}
         chosen = [index for index, view in enumerate(known) if view.name in names]
         step = self._context.run.begin_step("coarse", "looking for what moves", "photographs", len(chosen))
@@ -117,7 +119,7 @@ class _MotionSearch:
             for number, index in enumerate(chosen, start=1):
                 if index not in self._found:
                     own = self._residual(index)
-                    others = [self._residual(other) for other in overlapping_views(index, cameras, own.depth)]
+                    others = [self._residual(other) for other in overlapping_views(index, own, cameras)]
                     self._found[index] = _mask_view(self._opened, index, moving_pixels(own, others), self.folder)
                 show(number, len(chosen))
                 step(number)
