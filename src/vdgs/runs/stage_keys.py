@@ -40,11 +40,16 @@ class StageKeys:
 
 
 def stage_keys(
-    settings: RunSettings, coarse_model: str | None = None, motion: Mapping[str, Any] | None = None
+    settings: RunSettings,
+    coarse_model: str | None = None,
+    motion: Mapping[str, Any] | None = None,
+    cut: str | None = None,
 ) -> StageKeys:
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
     (`coarse_model`): trained again on another machine it may differ in its last bits. `motion` is the record of what
-    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not."""
+    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not. `cut` is the key
+    of the cut that is there: an older version's, which does not tell what the number of blocks followed from, stands.
+    """
     keys, plain = dict[str, str](), settings.to_dict()
     for stage, (sections, before) in STAGE_DEPENDENCIES.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
@@ -55,8 +60,28 @@ def stage_keys(
         if stage == "merge" and not settings.training.exposure_compensation:
             del own["merge"]["reference_exposure"]  # there is none, and runs of before stay as they are
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
-        keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+        keys[stage] = _digest(content)
+        if stage == "partition" and settings.partition.blocks == "auto" and keys[stage] != cut:
+            keys[stage] = _digest([*content, block_count_settings(settings)])
     return StageKeys(**keys)
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def block_count_settings(settings: RunSettings) -> dict[str, Any]:
+    """What the number of blocks follows from with `--blocks auto`, of the settings of blocks: what makes their training
+    take more memory (`memory_estimate.block_workload`)."""
+    block, compensation = settings.block, settings.block.compensation
+    return {
+        "is_margin_trained": block.margin != "frozen",
+        "max_anchors": [block.densify.max_anchors, block.max_anchors_total],
+        "has_swa": block.swa_fraction > 0,
+        "is_compensated": compensation.enabled,
+        "has_fixed_threshold": compensation.enabled and not compensation.t_low_quantile,
+        "downscale": min(factor for _, factor in block.resolution_schedule),
+    }
 
 
 def leaves_out_motion(settings: RunSettings, visibility_key: str, motion: Mapping[str, Any]) -> bool:
