@@ -85,9 +85,15 @@ def block_count_settings(settings: RunSettings) -> dict[str, Any]:
 
 
 def leaves_out_motion(settings: RunSettings, visibility_key: str, motion: Mapping[str, Any]) -> bool:
-    """Whether the blocks are trained with masks of what moves: with `auto`, where the record finds enough."""
+    """Whether the blocks are trained with masks of what moves: with `auto`, where a sample of the record has enough."""
     asked = settings.block.mask_moving
-    return asked == "on" or (asked == "auto" and motion.get("key") == visibility_key and bool(motion.get("masked")))
+    return asked == "on" or (asked == "auto" and motion.get("key") == visibility_key and moves_enough(motion))
+
+
+def moves_enough(motion: Mapping[str, Any]) -> bool:
+    """Whether `auto` masks what moves by this record, which `on` may have asked for. (Older versions recorded only
+    whether there are masks.)"""
+    return bool(motion.get("enough", motion.get("masked")))
 
 
 def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
