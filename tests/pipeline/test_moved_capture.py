@@ -26,7 +26,7 @@ from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
-from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture
+from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save_run_cameras
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import get_run_visibility
 
@@ -111,6 +111,28 @@ def test_the_kept_flight_is_that_of_the_capture(trained):
         assert (ours.packed == theirs.packed).all()
     assert (kept.scene_center == read.scene_center).all()
     assert (kept.ground.translation == read.ground.translation).all()
+
+
+def test_all_of_the_ground_frame_is_kept(trained):
+    run = RunFolder(trained / "run")
+    capture = open_capture(run)
+    ground = replace(
+        capture.ground, origin_geo=(47.0, 8.0, 400.0), axes_geo=(47.1, 8.1), accuracy="to 2 m", method="GPS"
+    )
+    before = run.cameras_file.read_bytes()
+    try:
+        save_run_cameras(run, replace(capture, ground=ground))
+        record = json.loads(run.cameras_file.read_text())
+        kept = load_run_cameras(run, {"fingerprint": record["fingerprint"]})
+    finally:
+        run.cameras_file.write_bytes(before)
+    assert kept is not None
+    for name, value in vars(ground).items():
+        assert (
+            np.array_equal(getattr(kept.ground, name), value)
+            if isinstance(value, np.ndarray)
+            else (getattr(kept.ground, name) == value)
+        ), name
 
 
 def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp_path):
@@ -248,6 +270,16 @@ def test_a_setting_in_the_file_that_cannot_be_is_named(folder, change, says, tmp
         main(["eval", str(folder / "run"), "--capture", str(folder / "place")])
     assert ended.value.code == 1
     assert f"config.yaml: {says}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("capture", ["place", "place/images"])
+def test_curves_without_their_package_are_refused_before_any_work(trained, tmp_path, capture, capsys, monkeypatch):
+    monkeypatch.setattr("vdgs.config.executor_options.find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(trained / capture), "--output", str(tmp_path / "new"), "--device", "cpu", "--tensorboard"])
+    assert ended.value.code == 1
+    assert 'pip install "vdgs[tensorboard]"' in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("verb", ["run", "eval"])

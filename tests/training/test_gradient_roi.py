@@ -92,7 +92,7 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, nar
     state, drawn = initial_state(small, decoder, stage), []
     with monkeypatch.context() as patch:
         if not narrowing:
-            patch.setattr(training_loop, "crop_to_gradient_support", lambda stage, splats, camera, box: box)
+            patch.setattr(training_loop, "crop_to_gradient_support", lambda stage, splats, camera, box, factors: box)
         draw = training_loop.render_for_training
         patch.setattr(
             training_loop, "render_for_training", lambda *given, **named: drawn.append(given) or draw(*given, **named)

@@ -43,7 +43,7 @@ def capture_fingerprint(capture: Capture) -> dict[str, int]:
 
 
 def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
-    """Raise RunError, naming what changed, unless `capture` is the one that `before` (capture_facts) describes."""
+    """Raise RunError, naming what changed, unless `capture` is the one that `before` (`capture_metadata`) describes."""
     known = (before or {}).get("fingerprint")
     if not isinstance(known, Mapping):
         raise RunError(
