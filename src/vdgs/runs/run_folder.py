@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.captures.reconstruction import is_reconstruction
@@ -183,14 +183,22 @@ class RunFolder:
         self.capture_file.unlink(missing_ok=True)
 
     def move_capture(self, to: Path) -> None:
-        """Save that the capture of the run lies elsewhere now; the caller checks that it is the same one."""
+        """Save that the capture of the run lies elsewhere now, with the files in it that options name; the caller
+        checks that it is the same one. RunError where the run of an older version would not know its model again."""
         settings, command = self.settings(), self.config.command()
         before, now = settings.capture_path, str(to.resolve())
         if before == now:
             return
+        moved_settings = settings.moved(to.resolve())
+        if self.coarse.is_done(self.keys().coarse) and not self.coarse.is_done(self.keys(moved_settings).coarse):
+            raise RunError(
+                f"{self.config_file}: was written by an older version, for a capture whose files options name by where "
+                f"they lay. Put the capture back to {before}, or begin another run: vdgs run CAPTURE --output RUN"
+            )
         words = shlex.split(command) if command else []
-        moved = shell_line(now if word == before else word for word in words) if before in words else None
-        self.config.write(replace(settings, capture_path=now), moved)
+        named = [now + word[len(before) :] if f"{word}/".startswith(f"{before}/") else word for word in words]
+        moved = shell_line(named) if before in words else None
+        self.config.write(moved_settings, moved)
 
     def settings(self) -> RunSettings:
         """The settings of the run (`ConfigFile.settings`)."""
@@ -203,8 +211,9 @@ class RunFolder:
     def keys(self, settings: RunSettings | None = None) -> StageKeys:
         """The key of every stage, for these settings or those that config.yaml holds, and for the coarse model and the
         record of what moves that are there."""
-        motion, cut = read_json_or_empty(self.motion_file), read_json_or_empty(self.partition_file)
-        return stage_keys(settings or self.settings(), self.coarse_model_id(), motion, cut.get("key"))
+        made = {"coarse": self.coarse.key(), "partition": read_json_or_empty(self.partition_file).get("key")}
+        motion = read_json_or_empty(self.motion_file)
+        return stage_keys(settings or self.settings(), self.coarse_model_id(), motion, made)
 
     @property
     def motion_file(self) -> Path:

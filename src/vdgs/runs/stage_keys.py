@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vdgs.runs.run_settings import RunSettings
@@ -43,14 +44,15 @@ def stage_keys(
     settings: RunSettings,
     coarse_model: str | None = None,
     motion: Mapping[str, Any] | None = None,
-    cut: str | None = None,
+    made: Mapping[str, str | None] | None = None,
 ) -> StageKeys:
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
     (`coarse_model`): trained again on another machine it may differ in its last bits. `motion` is the record of what
-    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not. `cut` is the key
-    of the cut that is there: an older version's, which does not tell what the number of blocks followed from, stands.
-    """
-    keys, plain = dict[str, str](), settings.to_dict()
+    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not. `made` are the
+    keys of the coarse model and of the cut that are there: those of older versions stand, which held absolute paths of
+    files in the capture, and did not tell what an automatic number of blocks followed from."""
+    keys, made = dict[str, str](), made or {}
+    plain, placed = settings.moved(Path()).to_dict(), settings.to_dict()
     for stage, (sections, before) in STAGE_DEPENDENCIES.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
         own: dict[str, Any] = {name: hashable_settings(name, plain[name]) for name in sections}
@@ -61,7 +63,10 @@ def stage_keys(
             del own["merge"]["reference_exposure"]  # there is none, and runs of before stay as they are
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = _digest(content)
-        if stage == "partition" and settings.partition.blocks == "auto" and keys[stage] != cut:
+        if stage == "coarse":
+            older = _digest([own | {"capture": hashable_settings("capture", placed["capture"])}])
+            keys[stage] = older if made.get(stage) == older else keys[stage]
+        if stage == "partition" and settings.partition.blocks == "auto" and made.get(stage) != keys[stage]:
             keys[stage] = _digest([*content, block_count_settings(settings)])
     return StageKeys(**keys)
 
