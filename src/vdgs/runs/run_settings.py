@@ -52,7 +52,7 @@ class RunSettings:
     def moved(self, to: Path) -> RunSettings:
         """The settings for the same capture at another place, where the files lie too that options name inside it."""
         before = Path(self.capture_path)
-        inside = {
+        inside: dict[str, Any] = {
             name: to / path.relative_to(before)
             for name, path in vars(self.capture).items()
             if isinstance(path, Path) and path.is_relative_to(before)
