@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from support.captures import render_plane, tiny_scene
 from vdgs.evaluation.moving_pixels import Residual, make_residual, moving_pixels, overlapping_views
+from vdgs.geometry.camera import Camera
+from vdgs.visibility.visibility_counts import NearbyCameras
 
 CAMERAS = list(tiny_scene(columns=3, rows=2, width=160, height=120).cameras.values())
 
@@ -33,8 +37,32 @@ BOX = np.s_[50:62, 80:102]  # where at least three of the others look
 
 
 def found(own: Residual) -> np.ndarray:
-    near = overlapping_views(2, CAMERAS, own.depth)
+    near = overlapping_views(2, own, NearbyCameras(CAMERAS))
     return moving_pixels(own, [residual(CAMERAS[other], ghost=0.3) for other in near])
+
+
+@pytest.mark.parametrize("index", range(len(CAMERAS)))
+def test_a_view_is_compared_with_those_that_see_most_of_it(index):
+    own = residual(CAMERAS[index])
+    places = CAMERAS[index].unproject(own.depth).reshape(-1, 3)
+    seen = [camera.in_frustum(places).mean() for camera in CAMERAS]
+    near = overlapping_views(index, own, NearbyCameras(CAMERAS))
+    assert index not in near
+    assert set(near) >= {other for other, share in enumerate(seen) if share > 0.1} - {index}
+    shares = [seen[other] for other in near]
+    assert np.all(np.diff(shares) < 0.1)
+
+
+def test_of_a_large_flight_only_what_is_near_is_asked(monkeypatch):
+    """Else photographs by photographs would be compared."""
+    own, hold, asked = residual(CAMERAS[2]), Camera.in_frustum, list[int]()
+    away = np.eye(4)
+    away[0, 3] = 1000.0
+    far = [replace(camera, camera_from_world=camera.camera_from_world @ away) for camera in 20 * CAMERAS]
+    near = overlapping_views(2, own, NearbyCameras(CAMERAS))
+    monkeypatch.setattr(Camera, "in_frustum", lambda self, places: asked.append(len(places)) or hold(self, places))
+    assert overlapping_views(2, own, NearbyCameras([*CAMERAS, *far])) == near
+    assert 0 < len(asked) < len(CAMERAS)
 
 
 def test_an_object_of_one_photograph_is_found_and_nothing_else():

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from vdgs.evaluation.by_visibility import VisibilityHistogram
-from vdgs.evaluation.splat_artifacts import ANGLE_EDGES, floater_share, needle_share, training_view_angles
+from vdgs.evaluation.splat_artifacts import (
+    ANGLE_EDGES,
+    MAX_ANGLE_PIXELS,
+    floater_share,
+    needle_share,
+    training_view_angles,
+)
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.kernels.kernel_types import Splats
@@ -65,6 +72,29 @@ def test_angles_are_those_to_the_nearest_camera_that_holds_the_place() -> None:
     assert middle == pytest.approx(math.degrees(math.atan(0.3)), abs=0.5)
     assert np.isnan(angles[:, 0]).all()
     assert angles[20, 2] == 180.0  # outside both pictures
+
+
+def test_only_cameras_that_reach_what_a_view_shows_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight of thousands of photographs has dozens near each place."""
+    depth = 10.0 + np.random.default_rng(0).uniform(-1, 1, (240, 320))
+    depth[:100, :100] = np.inf
+    camera = replace(camera_at(0.0), fx=300.0, fy=300.0, cx=160.0, cy=120.0, width=320, height=240)
+    flight = [camera_at(0.5 * k) for k in range(-200, 200)]
+    asked, hold = list[int](), Camera.in_frustum
+    monkeypatch.setattr(Camera, "in_frustum", lambda self, places: asked.append(len(places)) or hold(self, places))
+    found = training_view_angles(camera, depth, flight)
+    pixels = np.isfinite(found)
+    assert 0 < sum(asked) < 0.15 * pixels.sum() * len(flight)
+    places = camera.unproject(np.where(pixels, depth, 1.0))[pixels]
+    toward = camera.position - places
+    expected = np.full(len(places), 180.0)
+    for other in flight:
+        back = other.position - places
+        lengths = np.linalg.norm(toward, axis=1) * np.linalg.norm(back, axis=1)
+        angle = np.degrees(np.arccos(((toward * back).sum(axis=1) / lengths).clip(-1, 1)))
+        expected = np.where(hold(other, places), np.minimum(expected, angle), expected)
+    assert np.allclose(found[pixels], expected, atol=1e-5)
+    assert pixels.sum() > 0.5 * MAX_ANGLE_PIXELS
 
 
 def test_bins_are_cut_at_given_values() -> None:

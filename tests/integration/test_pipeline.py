@@ -16,7 +16,7 @@ from vdgs.evaluation.evaluate_run import IsolatedBlocks
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.partition.assignment.score_file import load_scores
-from vdgs.partition.blocks import load_blocks, xy_positions
+from vdgs.partition.blocks import Blocks, load_blocks, xy_positions
 from vdgs.pipeline.dense_points import PIXELS_PER_POINT
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
@@ -123,9 +123,14 @@ def bits(decoder: Decoder) -> dict[str, bytes]:
     return {name: tensor.detach().numpy().tobytes() for name, tensor in decoder.tensors().items()}
 
 
-def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbroken):
+def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbroken, monkeypatch):
     run, coarse = RunFolder(unbroken), AnchorModel.load(unbroken / "coarse/model.safetensors")
-    alone = IsolatedBlocks(run, coarse).assemble(1)
+    asked, owner = list[int](), Blocks.owner
+    monkeypatch.setattr(Blocks, "owner", lambda self, points: asked.append(len(points)) or owner(self, points))
+    blocks = IsolatedBlocks(run, coarse)
+    other, alone = blocks.assemble(0), blocks.assemble(1)
+    assert asked == [len(coarse.anchors)]  # for both: of millions it takes seconds
+    assert len(other.anchors) != len(alone.anchors)
     own = AnchorModel.load(unbroken / "blocks/01/model.safetensors")
     assert [part.count for part in alone.decoder_spans] == [len(own.anchors), len(alone.anchors) - len(own.anchors)]
     assert [bits(part.decoder) for part in alone.decoder_spans] == [bits(own.decoder), bits(coarse.decoder)]

@@ -10,16 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from support.hand_made_models import camera_above, model_at, opaque_plane, quadrants
 from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
 from vdgs.export.bake import bake, collect_contributions
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.exposure import apply_exposure, exposure_matrix
 from vdgs.model.local_exposure import LocalExposure, apply_departures, fit_local_exposure
 from vdgs.model.renderer import render
 from vdgs.partition.merging import merge_blocks
+from vdgs.pipeline.train_block import keep_coarse_block
+from vdgs.runs.model_integrity import load_verified
+from vdgs.runs.stage_folder import StageFolder
 
 GRID = LocalExposure(torch.arange(2 * 3 * 12).float().view(2, 3, 3, 4), x=-1.0, y=2.0, spacing=0.5)
 ONE = torch.tensor([[0.1, -0.05, 0.02, 0.03], [0.0, -0.2, 0.04, -0.01], [0.05, 0.0, 0.3, 0.02]])
@@ -192,3 +196,12 @@ def test_the_merge_keeps_it_unless_one_exposure_is_asked_for():
             coarse, [None] * 4, blocks, cameras, MergeConfig(reference_exposure=asked), allow_missing=True
         )
         assert merged.local_exposure is kept
+
+
+def test_a_block_that_stays_as_it_is_is_kept_in_one_exposure_as_all_blocks_are(tmp_path):
+    """Else its pictures would be measured in the exposure of their place and in that of the view."""
+    folder, model = StageFolder(tmp_path), replace(opaque_plane(), local_exposure=everywhere(ONE))
+    keep_coarse_block(folder, replace(model, metadata=ModelMetadata(block=0, key="k")), 0, Console(quiet=True))
+    kept = load_verified(folder, "k", 0)
+    assert kept.local_exposure is None
+    assert torch.equal(kept.anchors.positions, model.anchors.positions)

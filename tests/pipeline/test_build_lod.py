@@ -403,7 +403,7 @@ def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
     assert not has_lod(coarse.run, coarse.location)
     with pytest.raises(RunError, match=r"tree is of another version of vdgs\. Make it: vdgs lod .*--model coarse"):
         open_tree(opened)
-    for merged, end in (("1-c", " --model coarse"), (None, "")):
+    for merged, end in (("1-c", " --model coarse"), ("", "")):
         models = {
             "coarse": SimpleNamespace(output_id=opened.status.model_id),
             "merge": SimpleNamespace(output_id=merged),

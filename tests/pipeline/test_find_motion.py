@@ -90,10 +90,16 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys, monkeypatch):
     vdgs("report", run)
     assert "What moves" in (run / "report.html").read_text()
     config.write_text(config.read_text().replace("mask_moving: 'on'", "mask_moving: auto"))
+    # `auto` goes by its sample, though `on` made masks.
+    context = RunContext.from_path(run)
+    assert with_motion_masks(context.run, context.capture) is context.capture
+    vdgs("visibility", run)
+    assert json.loads((run / MOTION_FILE).read_text()) == sampled
+    assert sorted(file.name for file in (run / MOTION_FILE).parent.iterdir()) == ["key", "motion.json"]
     monkeypatch.setattr(find_motion, "MIN_MOVING_SHARE", MIN_MOVING_SHARE)
     (run / MOTION_FILE).unlink()
     vdgs("visibility", run)
-    assert json.loads((run / MOTION_FILE).read_text()) == record
+    assert json.loads((run / MOTION_FILE).read_text()) == record | {"enough": True}
     assert context.run.keys().blocks == RunContext.from_path(run).run.keys().blocks
     config.write_text(config.read_text().replace("mask_moving: auto", "mask_moving: 'off'"))
     vdgs("visibility", run)
@@ -106,7 +112,8 @@ def test_the_setting_counts_by_what_it_does():
     still, found = stage_keys(plain), {"key": stage_keys(plain).visibility, "masked": True}
     assert still == stage_keys(replace(plain, block=BlockConfig(mask_moving="off")), motion=found)
     assert still == stage_keys(plain, motion=found | {"masked": False}) == stage_keys(plain, motion=found | {"key": ""})
-    assert on == stage_keys(plain, motion=found)
+    assert on == stage_keys(plain, motion=found) == stage_keys(plain, motion=found | {"enough": True})
+    assert still == stage_keys(plain, motion=found | {"enough": False})  # masks that `on` asked for
     assert (still.coarse, still.assignment) == (on.coarse, on.assignment)
     assert still.blocks != on.blocks
 

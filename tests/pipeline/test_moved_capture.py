@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
 from vdgs.cli.main import main
+from vdgs.cli.start_settings import start_settings
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RenderRequest
 from vdgs.config.executor_options import CheckpointOptions
@@ -26,8 +28,9 @@ from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
-from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture
+from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save_run_cameras
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.stage_keys import hashable_settings
 from vdgs.runs.visibility_store import get_run_visibility
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
@@ -86,6 +89,52 @@ def test_a_capture_that_moved_is_taken_where_it_is_given(folder, redo):
     assert run.coarse.is_done(run.keys().coarse)
 
 
+@pytest.fixture
+def listed(tmp_path) -> Path:
+    """A folder with a run whose test photographs a list in the capture names, and the capture, which moved."""
+    write_colmap(tmp_path / "place", tiny_scene())
+    names = sorted(file.name for file in (tmp_path / "place" / "images").iterdir())
+    (tmp_path / "place" / "mine.txt").write_text("\n".join(names[:2]))
+    options = replace(UP, test_list=tmp_path / "place" / "mine.txt")
+    train_coarse(
+        create_or_resume_run(tmp_path / "place", tmp_path / "run", options, METHOD), CheckpointOptions(), QUIET
+    )
+    (tmp_path / "place").rename(tmp_path / "moved")
+    return tmp_path
+
+
+@pytest.mark.parametrize("redo", [None, False, "named"])
+def test_files_in_a_capture_that_moved_moved_with_it(listed, redo):
+    run = RunFolder(listed / "run")
+    before = run.keys()
+    if redo == "named":
+        relocate_capture(run, listed / "moved")
+    else:
+        options = replace(UP, test_list=listed / "moved" / "mine.txt")
+        create_or_resume_run(listed / "moved", run.path, options, METHOD, overwrite=redo)
+    assert run.settings().capture.test_list == listed / "moved" / "mine.txt"
+    assert len(open_run(run.path).capture.test_views) == 2
+    assert run.keys() == before
+    assert run.coarse.is_done(run.keys().coarse)
+
+
+def test_a_command_that_names_the_capture_alone_finds_its_files(listed):
+    given = {"output": listed / "run", "capture": listed / "moved"}
+    assert start_settings(given).options.test_list == listed / "moved" / "mine.txt"
+
+
+def test_a_run_of_an_older_version_knows_its_model_while_the_capture_lies_there(listed):
+    run = RunFolder(listed / "run")
+    own = {name: run.settings().to_dict()[name] for name in ("capture", "training")}
+    own = {name: hashable_settings(name, values) for name, values in own.items()}
+    old = hashlib.sha256(json.dumps([own], sort_keys=True).encode()).hexdigest()[:16]
+    new = run.keys().coarse
+    (run.coarse.path / "key").write_text(old)
+    assert new != old == run.keys().coarse
+    with pytest.raises(RunError, match=f"Put the capture back to {listed}/place"):
+        relocate_capture(run, listed / "moved")
+
+
 def test_what_needs_the_capture_says_how_to_name_it(folder):
     run = RunFolder(folder / "run")
     with pytest.raises(CaptureError, match=r"gone/place: the capture of .* is not there.*--capture PATH"):
@@ -111,6 +160,28 @@ def test_the_kept_flight_is_that_of_the_capture(trained):
         assert (ours.packed == theirs.packed).all()
     assert (kept.scene_center == read.scene_center).all()
     assert (kept.ground.translation == read.ground.translation).all()
+
+
+def test_all_of_the_ground_frame_is_kept(trained):
+    run = RunFolder(trained / "run")
+    capture = open_capture(run)
+    ground = replace(
+        capture.ground, origin_geo=(47.0, 8.0, 400.0), axes_geo=(47.1, 8.1), accuracy="to 2 m", method="GPS"
+    )
+    before = run.cameras_file.read_bytes()
+    try:
+        save_run_cameras(run, replace(capture, ground=ground))
+        record = json.loads(run.cameras_file.read_text())
+        kept = load_run_cameras(run, {"fingerprint": record["fingerprint"]})
+    finally:
+        run.cameras_file.write_bytes(before)
+    assert kept is not None
+    for name, value in vars(ground).items():
+        assert (
+            np.array_equal(getattr(kept.ground, name), value)
+            if isinstance(value, np.ndarray)
+            else (getattr(kept.ground, name) == value)
+        ), name
 
 
 def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp_path):
@@ -194,6 +265,10 @@ def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder,
     settings, gone = run.settings(), tmp_path / "gone" / "place"
     for command, moved in (
         (f"vdgs run {gone} --output 'a run' --overwrite", f"vdgs run {folder}/place --output 'a run' --overwrite"),
+        (
+            f"vdgs run {gone} --gps {gone}/g.csv -o {gone}s",
+            f"vdgs run {folder}/place --gps {folder}/place/g.csv -o {gone}s",
+        ),
         ("vdgs run place --output run", None),
         (None, None),
     ):
@@ -248,6 +323,16 @@ def test_a_setting_in_the_file_that_cannot_be_is_named(folder, change, says, tmp
         main(["eval", str(folder / "run"), "--capture", str(folder / "place")])
     assert ended.value.code == 1
     assert f"config.yaml: {says}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("capture", ["place", "place/images"])
+def test_curves_without_their_package_are_refused_before_any_work(trained, tmp_path, capture, capsys, monkeypatch):
+    monkeypatch.setattr("vdgs.config.executor_options.find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(trained / capture), "--output", str(tmp_path / "new"), "--device", "cpu", "--tensorboard"])
+    assert ended.value.code == 1
+    assert 'pip install "vdgs[tensorboard]"' in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("verb", ["run", "eval"])

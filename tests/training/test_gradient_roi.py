@@ -13,7 +13,15 @@ from support.rasterize_scenes import make_scene, splats_of
 from vdgs.config.method import BlockConfig
 from vdgs.kernels import get_backend
 from vdgs.kernels.kernel_types import Splats
-from vdgs.training import FrozenAnchors, TrainingProblem, TrainingState, initial_state, train_step, training_loop
+from vdgs.training import (
+    FrozenAnchors,
+    TrainingProblem,
+    TrainingState,
+    initial_state,
+    pseudo_views,
+    train_step,
+    training_loop,
+)
 from vdgs.training.crops import Crop
 from vdgs.training.gradient_roi import splat_bounds
 
@@ -84,7 +92,7 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, nar
     state, drawn = initial_state(small, decoder, stage), []
     with monkeypatch.context() as patch:
         if not narrowing:
-            patch.setattr(training_loop, "crop_to_gradient_support", lambda stage, splats, camera, box: box)
+            patch.setattr(training_loop, "crop_to_gradient_support", lambda stage, splats, camera, box, factors: box)
         draw = training_loop.render_for_training
         patch.setattr(
             training_loop, "render_for_training", lambda *given, **named: drawn.append(given) or draw(*given, **named)
@@ -120,6 +128,20 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
     assert float(theirs.statistics.gradient.max()) > 0
     for name in ("drawn", "opacity", "seen"):
         assert torch.equal(getattr(ours.statistics, name), getattr(theirs.statistics, name))
+
+
+def test_a_step_begins_its_pseudo_view_at_any_place_of_the_box(monkeypatch):
+    """As on a GPU, where nothing narrows it: the same pseudo views."""
+    begun = []
+    monkeypatch.setattr(pseudo_views, "START_FRACTION", 0.0)
+    monkeypatch.setattr(training_loop, "pseudo_step", lambda *given: begun.append(given[3].camera) or True)
+    for stage in stages().values():
+        loss = replace(stage.config.loss, pseudo_views=0.3)
+        for narrowing in (True, False):
+            step(monkeypatch, replace(stage, config=replace(stage.config, loss=loss)), True, narrowing)
+        ours, theirs = begun[-2:]
+        assert (ours.packed == theirs.packed).all()
+    assert len(begun) == 6
 
 
 def test_a_block_with_nothing_around_it_draws_all(monkeypatch):

@@ -15,6 +15,7 @@ from vdgs.kernels.kernel_types import Raster, TrainingSplats
 from vdgs.model.renderer import render
 from vdgs.training import train, training_loop
 from vdgs.training.depth_agreement import MIN_ALPHA, SMOOTH_BELOW, DepthAgreement, depth_agreement
+from vdgs.training.gradient_roi import crop_to_gradient_support
 from vdgs.training.target import opacity_factors_at
 from vdgs.training.training_step import render_for_training
 
@@ -82,14 +83,17 @@ def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:
     assert abs(float(one.std()) - 0.2) < 0.01
 
 
+def one_splat(opacity: float) -> TrainingSplats:
+    return TrainingSplats(
+        means_px=torch.tensor([[9.0, 9.0]]), conics=torch.tensor([[0.1, 0.0, 0.1]]), depths=torch.ones(1),
+        colors=torch.ones(1, 3), opacities=torch.tensor([opacity]), segments=None,
+        source=torch.zeros(1, dtype=torch.int32), volume=torch.tensor(1.0),
+    )  # fmt: skip
+
+
 def test_the_gradient_of_an_opacity_is_that_of_its_noisy_self() -> None:
     """A factor of 2 of all opacities is a model that is twice as opaque, and moves twice as fast."""
-    camera, background = Photographs().camera(0), torch.zeros(3)
-    splats = TrainingSplats(
-        means_px=torch.tensor([[9.0, 9.0]]), conics=torch.tensor([[0.1, 0.0, 0.1]]), depths=torch.ones(1),
-        colors=torch.ones(1, 3), opacities=torch.tensor([0.3]), segments=None, source=torch.zeros(1, dtype=torch.int32),
-        volume=torch.tensor(1.0),
-    )  # fmt: skip
+    camera, background, splats = Photographs().camera(0), torch.zeros(3), one_splat(0.3)
     double = replace(splats, opacities=2 * splats.opacities)
     plain = render_for_training(double, camera, background)
     noisy = render_for_training(splats, camera, background, opacity_factors=torch.tensor([2.0]))
@@ -97,3 +101,24 @@ def test_the_gradient_of_an_opacity_is_that_of_its_noisy_self() -> None:
     slope = torch.ones_like(plain.image)
     expected = 2 * plain.backward(slope, 0.0).opacities
     torch.testing.assert_close(noisy.backward(slope, 0.0).opacities, expected)
+
+
+def test_an_opacity_whose_noisy_self_is_limited_has_no_gradient() -> None:
+    """As autograd has it: what is drawn follows it no more."""
+    camera, background = Photographs().camera(0), torch.zeros(3)
+    drawn = render_for_training(one_splat(0.8), camera, background, opacity_factors=torch.tensor([2.0]))
+    gradients = drawn.backward(torch.ones_like(drawn.image), 0.0)
+    assert float(gradients.opacities) == 0.0
+    assert float(gradients.colors.abs().max()) > 0
+
+
+def test_a_step_draws_as_far_as_splats_reach_with_their_noise() -> None:
+    stage, _ = block_stage(BlockConfig())
+    camera, factors = Photographs().camera(0), torch.tensor([2.0])
+    areas = []
+    for opacity, given in ((0.2, None), (0.2, factors), (0.4, None)):
+        left, top, right, bottom = crop_to_gradient_support(
+            stage, one_splat(opacity), camera, (0, 0, camera.width, camera.height), given
+        )
+        areas.append((right - left) * (bottom - top))
+    assert areas[0] < areas[1] == areas[2]

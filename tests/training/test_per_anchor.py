@@ -9,6 +9,7 @@ import torch
 
 from support.block_training import CONFIG, block_stage
 from vdgs.config.method import BlockConfig, CompensationConfig
+from vdgs.system.memory.memory_estimate import bytes_per_anchor
 from vdgs.training import TrainingState, to_checkpoint
 from vdgs.training.per_anchor_tensors import index_anchors, index_rows
 from vdgs.training.weight_averaging import ModelAverage
@@ -63,3 +64,23 @@ def test_all_that_is_kept_moves_with_its_anchor():
             new = added.tensors()[key] if name == "anchors" else old.new_zeros(2, *old.shape[1:])
             assert torch.equal(tensor, torch.cat([old, new])[order]), (name, key)
     assert len(state.anchors) == n - 3
+
+
+def test_nothing_keeps_the_memory_of_tensors_that_were_taken():
+    """Else growth and sorting would hold the whole state twice."""
+    state = full_state()
+    taken = state.take_groups()
+    left = [tensor for group in state.groups().values() for tensor in group.values()]
+    assert len(left) == sum(len(group) for group in taken.values())
+    assert all(tensor.untyped_storage().nbytes() == 0 for tensor in left)
+    assert all(len(tensor) for group in taken.values() for tensor in group.values())
+
+
+def test_the_estimate_counts_what_is_kept_of_an_anchor():
+    """And two moments of its position, which never moves and has none."""
+    for enabled in (False, True):
+        training = replace(CONFIG, compensation=CompensationConfig(enabled=enabled))
+        _, state = block_stage(BlockConfig(), training=training)
+        kept = sum(tensor.nbytes for group in state.groups().values() for tensor in group.values())
+        estimated = len(state.anchors) * bytes_per_anchor(state.anchors.offsets.shape[1], 0.0, enabled)
+        assert estimated == kept + len(state.anchors) * 2 * 12

@@ -99,6 +99,21 @@ def test_what_the_photograph_does_not_see_or_is_masked_does_not_count() -> None:
     assert 0 < part.valid_fraction < all_of_it.valid_fraction
 
 
+def test_a_pixel_weighs_the_same_whatever_part_of_the_photograph_a_pseudo_view_is_near() -> None:
+    whole = Photographs().camera(0)
+    weights = []
+    for seen in (whole, whole.cropped(4, 0, 44, 40), whole.cropped(14, 10, 34, 30)):
+        image = torch.zeros(seen.height, seen.width, 3, dtype=torch.uint8)
+        target = TrainingTarget(image=image, mask=None, camera=seen, valid_fraction=0.5)
+        camera = pseudo_camera(seen, plane(seen)[0], np.random.default_rng(0))
+        assert camera is not None
+        found = warp_photograph(target, plane(seen)[0], camera, plane(camera)[0], HEIGHT)
+        assert found is not None
+        assert found.mask is not None
+        weights.append(found.valid_fraction / int(found.mask.sum()))
+    assert weights == pytest.approx([1 / (SIZE**2 * whole.width * whole.height)] * 3, rel=0.05)
+
+
 def trained(iterations: int = 60) -> tuple[TrainingProblem, TrainingState]:
     """The plane after so many steps without pseudo views. From so high a camera all depths agree."""
     anchors, decoder = coarse()

@@ -24,7 +24,7 @@ from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_r
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training import PSNR_LOG_INTERVAL, TrainingImages, view_at
 from vdgs.training.optimizer import AdamMoments
-from vdgs.training.per_anchor_tensors import TensorGroup, index_anchors
+from vdgs.training.per_anchor_tensors import TensorGroup, index_anchors, without_rows
 from vdgs.training.training_loop import LOSS_DECAY, PSNR_DECAY, exponential_mean, training_psnr
 
 
@@ -162,7 +162,7 @@ class Gs3dState:
         """What is kept per Gaussian and outlives a decision, no longer held here: see
         `per_anchor_tensors.index_anchors`."""
         groups = {"gaussians": self.gaussians.tensors(), "first": self.moments.first, "second": self.moments.second}
-        self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
+        self.put_groups(without_rows(groups))
         return groups
 
     def put_groups(self, groups: dict[str, TensorGroup]) -> None:

@@ -36,7 +36,8 @@ def start_settings(given: GivenArguments) -> StartSettings:
     A run that is there reads its capture as before, and without a preset it keeps its own method; a new one takes
     `NEW_RUN_PRESET`. Raises VdgsError for a file of settings that does not work and for a device that is none.
     """
-    named, file, own = given.get("preset"), given.get("config"), _own_settings(given.get("output"))
+    named, file = given.get("preset"), given.get("config")
+    own = _own_settings(given.get("output"), given.get("capture"))
     preset: PresetName | None = None if named in (None, "auto") else named
     reason = ""
     if preset is None and own is None:
@@ -51,13 +52,14 @@ def start_settings(given: GivenArguments) -> StartSettings:
     return StartSettings(preset=preset, options=options, method=method, reason=reason)
 
 
-def _own_settings(output: Path | None) -> Any:
-    """The settings of the run in a folder (`RunSettings`); None where there is none."""
+def _own_settings(output: Path | None, capture: Path | None) -> Any:
+    """The settings of the run in a folder (`RunSettings`), whose capture may have moved; None where there is none."""
     if output is None or not (output / "config.yaml").is_file():
         return None
     from vdgs.runs.run_folder import RunFolder
 
-    return RunFolder(output).settings()
+    own = RunFolder(output).settings()
+    return own if capture is None or Path(own.capture_path).exists() else own.moved(capture.resolve())
 
 
 def _device_of_new_run(device: str) -> str:

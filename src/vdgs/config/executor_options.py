@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Annotated, Literal
 
 from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, WORKER_COUNT, Range, check_ranges
@@ -83,3 +84,5 @@ class CheckpointOptions:
     def check(self) -> None:
         """Raise VdgsError for values that do not work."""
         check_ranges(self)
+        if self.tensorboard and find_spec("tensorboard") is None:  # before the long work
+            raise VdgsError('--tensorboard: TensorBoard is not installed: pip install "vdgs[tensorboard]"')

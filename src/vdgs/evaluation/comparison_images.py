@@ -78,7 +78,7 @@ def draw_comparison(
     mask: np.ndarray | None = None,
     limit: float = ERROR_LIMIT,
 ) -> Image.Image:
-    """Photograph | render | error with its color bar. `figures` stands beside the render's label;
+    """Photograph | render | error with its color bar. `metrics_text` stands beside the render's label;
     masked pixels of the error are white."""
     error = absolute_error(image, reference)
     if mask is not None:

@@ -6,10 +6,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from rich.console import Console
 
 from vdgs.captures.camera_height import camera_height
@@ -30,6 +31,7 @@ from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.renderer import background_image, render, render_scalar_map, view_splats
 from vdgs.partition.block_regions import split_trainable_anchors
+from vdgs.partition.blocks import xy_positions
 from vdgs.runs.lod_folder import drawn_scene
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import OpenedRun, load_run_blocks
@@ -208,13 +210,14 @@ class IsolatedBlocks:
 
     def __init__(self, run: RunFolder, coarse: AnchorModel):
         self._run, self._coarse = run, coarse
-        blocks, config, key = load_run_blocks(run), run.method().block, run.keys().blocks
-        self._key = key
-        self._around = [
-            split_trainable_anchors(coarse.anchors, blocks, index, config)[1] for index in range(len(blocks))
-        ]
-        self._done = [run.block(index).is_done(key) for index in range(len(blocks))]
+        self._blocks, self._config, self._key = load_run_blocks(run), run.method().block, run.keys().blocks
+        self._done = [run.block(index).is_done(self._key) for index in range(len(self._blocks))]
         self._held: OrderedDict[int, AnchorModel] = OrderedDict()
+
+    @cached_property
+    def _owner(self) -> Int64[np.ndarray, " n"]:
+        """The block of each coarse anchor: of millions it takes seconds, for all blocks alike."""
+        return self._blocks.owner(xy_positions(self._coarse.anchors.positions))
 
     def render(self, index: int, camera: Camera) -> Raster | None:
         """The block's own picture; None if it was not trained (merged with --allow-missing-blocks)."""
@@ -230,9 +233,10 @@ class IsolatedBlocks:
     def assemble(self, index: int) -> AnchorModel:
         """A block's own anchors and what stood around them in its training, each with its decoder."""
         own = load_verified(self._run.block(index), self._key, index).to(self._coarse.anchors.positions.device)
-        around = self._coarse.anchors.select(self._around[index])
+        coarse = self._coarse.anchors
+        around = coarse.select(split_trainable_anchors(coarse, self._blocks, index, self._config, self._owner)[1])
         parts = DecoderSpan(len(own.anchors), own.decoder), DecoderSpan(len(around), self._coarse.decoder)
-        return replace(own, anchors=own.anchors.concat(around), decoder_spans=parts)
+        return replace(own.without_local_exposure(), anchors=own.anchors.concat(around), decoder_spans=parts)
 
 
 def _bytes(model: AnchorModel) -> int:

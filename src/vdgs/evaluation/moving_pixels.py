@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.visibility.visibility_counts import NearbyCameras
 
 #: Longest side of the pictures that are compared: cars keep some 10 pixels, and a comparison takes a second.
 COMPARED_SIZE_PX = 480
@@ -71,14 +72,14 @@ def make_residual(
     return Residual(small, blurred.astype(np.float32), near)
 
 
-def overlapping_views(index: int, cameras: Sequence[Camera], depth: Float[np.ndarray, "h w"]) -> list[int]:
-    """The other cameras that see most of what a view shows, at most `MAX_OTHERS`; `depth` is that of the view."""
-    step = max(1, max(depth.shape) // 12)
-    solid = np.isfinite(depth)
-    points = cameras[index].limit_size(COMPARED_SIZE_PX).unproject(np.where(solid, depth, 0))[::step, ::step]
-    points = points[solid[::step, ::step]]
-    seen = [0 if other == index else int(camera.in_frustum(points).sum()) for other, camera in enumerate(cameras)]
-    most = sorted(range(len(cameras)), key=lambda other: (-seen[other], abs(other - index)))[:MAX_OTHERS]
+def overlapping_views(index: int, own: Residual, cameras: NearbyCameras) -> list[int]:
+    """The others of all cameras that see most of what the view of this index shows, at most `MAX_OTHERS`."""
+    step = max(1, max(own.depth.shape) // 12)
+    solid = np.isfinite(own.depth)
+    points = own.camera.unproject(np.where(solid, own.depth, 0))[::step, ::step][solid[::step, ::step]]
+    near = [int(other) for other in cameras.indices(torch.from_numpy(points)) if other != index]
+    seen = {other: int(cameras.cameras[other].in_frustum(points).sum()) for other in near}
+    most = sorted(seen, key=lambda other: (-seen[other], abs(other - index)))[:MAX_OTHERS]
     return [other for other in most if seen[other]]
 
 

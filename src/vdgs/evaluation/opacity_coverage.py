@@ -131,8 +131,8 @@ def summarize_oversized_splats(rows: Sequence[Mapping[str, Any]]) -> dict[str, i
 def coverage_map(
     draw_depth: Callable[[Camera], Raster], cameras: Sequence[Camera], min_views: int = MIN_SEEN_BY
 ) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
-    """Camera of a view -> which of its pixels show a place that lies in the pictures of at least `least` of `cameras`
-    (the training cameras; without occlusion, as in V).
+    """Camera of a view -> which of its pixels show a place that lies in the pictures of at least `min_views` of
+    `cameras` (the training cameras; without occlusion, as in V).
 
     A solid pixel shows the point at which the model behind `draw_depth` (a render with depth) is half opaque. All other
     pixels continue the depth of the nearest solid ones, down to the ground but not up into the sky: beyond what cameras

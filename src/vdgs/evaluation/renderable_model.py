@@ -53,7 +53,8 @@ class RenderableModel:
     #: What is behind the model in a render, RGB in [0, 1]: one color, or an image where this is given and returns one.
     background: tuple[float, float, float] | None = None
     background_image: Callable[[Camera], Float[Tensor, "h w 3"] | None] | None = None
-    #: Pixels that show what enough training cameras see (`evaluation.seen`); solidity and depth are measured on them.
+    #: Pixels that show what enough training cameras see (`opacity_coverage.coverage_map`); solidity and depth are
+    #: measured on them.
     coverage_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
     #: Depth along the axis of a view's camera, inf for sky; then these two are needed as well: the model's own depth
     #: (not timed), and how high cameras are above ground. All in the units of the model.

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2
 from vdgs.kernels.kernel_types import Splats
 from vdgs.model.renderer import rasterize_splats
+from vdgs.visibility.visibility_counts import NearbyCameras
 
 #: A splat is a needle where its standard deviation across (pixels, before the blur of a pixel) is below the first, or
 #: that along it is more than the second times as long. Shorter ones than the third are dots.
@@ -26,6 +28,8 @@ NEEDLE_WIDTH_PX, NEEDLE_RATIO, DOT_PX = 0.1, 10.0, 0.5
 FLOATER_THRESHOLD = 0.02
 #: Angles are computed at so many pixels of a view at most, evenly spread.
 MAX_ANGLE_PIXELS = 20_000
+#: So many of them, across and down, are asked of the training cameras that reach them.
+PATCH_SIDE = 36
 #: Bins by angle (degrees) end below these; the last one is open.
 ANGLE_EDGES = (10.0, 20.0, 40.0)
 ARTIFACT_KEYS = ("needles", "floaters")
@@ -69,16 +73,27 @@ def training_view_angles(
     some = np.zeros(depth.shape, bool)
     some[step // 2 :: step, step // 2 :: step] = True
     some &= np.isfinite(depth)
-    places = camera.unproject(np.where(np.isfinite(depth), depth, 1.0))[some]
+    places = camera.unproject(np.where(np.isfinite(depth), depth, 1.0))
+    angles, nearby, side = np.full(depth.shape, np.nan), NearbyCameras(cameras), step * PATCH_SIDE
+    for top, left in product(range(0, depth.shape[0], side), range(0, depth.shape[1], side)):
+        patch = np.s_[top : top + side, left : left + side]
+        shown = places[patch][some[patch]]
+        # Of thousands of cameras a few dozen reach what a patch shows.
+        angles[patch][some[patch]] = _least_angles(camera, shown, nearby.of(torch.from_numpy(shown)))
+    return angles
+
+
+def _least_angles(
+    camera: Camera, places: Float[np.ndarray, "n 3"], cameras: Sequence[Camera]
+) -> Float[np.ndarray, " n"]:
+    """The angle in degrees at each place between a camera and the nearest of others that hold it; 180 without any."""
     toward = _unit(camera.position - places)
     best = np.full(len(places), -1.0)
     for other in cameras:
         held = np.flatnonzero(other.in_frustum(places))
         cosine = (toward[held] * _unit(other.position - places[held])).sum(axis=1)
         best[held] = np.maximum(best[held], cosine)
-    angles = np.full(depth.shape, np.nan)
-    angles[some] = np.degrees(np.arccos(np.clip(best, -1.0, 1.0)))
-    return angles
+    return np.degrees(np.arccos(np.clip(best, -1.0, 1.0)))
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

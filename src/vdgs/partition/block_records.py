@@ -54,7 +54,7 @@ class PartitionRecord:
     assignment_warnings: tuple[str, ...] = ()
     blocks: tuple[BlockCamerasRecord, ...] = ()
     spatial_only_blocks: tuple[BlockRecord, ...] = ()
-    """The cut that place alone would give, to compare with."""
+    """The cut that place alone would give, to compare with where visibility has a part in the cut."""
     seconds: float | None = None
     peak_memory_bytes: int | None = None
 

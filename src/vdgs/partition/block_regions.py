@@ -25,14 +25,16 @@ from vdgs.partition.blocks import Blocks, xy_positions
 RAMP_TABLE_SIZE = 512
 
 
-def split_trainable_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
-    """What a block moves and what it only draws, as two masks [n].
+def split_trainable_anchors(
+    anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig, owner: Int64[np.ndarray, " n"] | None = None
+) -> tuple[Tensor, Tensor]:
+    """What a block moves and what it only draws, as two masks [n]; `owner` of the anchors, if already known.
 
     Own are the anchors of the core (with a ring that is not frozen: of the widened block). Around are the ring and,
     with `config.draw_outside`, everything else.
     """
     points = xy_positions(anchors.positions)
-    owner = blocks.owner(points)
+    owner = blocks.owner(points) if owner is None else owner
     core, reached = owner == index, blocks.in_expanded(index, points, owner)
     own = core if config.margin == "frozen" else reached
     around = ~own if config.draw_outside else reached & ~own

@@ -9,6 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -79,6 +80,14 @@ class Blocks:
         near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north) & ~reached)
         reached[near] = shapely.contains_xy(boundary, x[near], y[near])
         return reached
+
+
+def rows_by_owner(owner: Int64[np.ndarray, " n"], blocks: int) -> list[Int64[np.ndarray, " _"]]:
+    """The points that each of so many blocks owns, ascending. Sorted once: looked up for each block, thousands of
+    blocks would take longer than their cut."""
+    order = np.argsort(owner, kind="stable")
+    bounds = np.searchsorted(owner[order], np.arange(blocks + 1))
+    return [order[begin:end] for begin, end in pairwise(bounds)]
 
 
 def save_blocks(

@@ -36,9 +36,11 @@ from vdgs.runs.open_run import OpenedRun, check_has_anchors
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import MOTION_EXAMPLES
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.system.atomic_files import write_array, write_bytes, write_json
+from vdgs.runs.stage_keys import moves_enough
+from vdgs.system.atomic_files import read_json, write_array, write_bytes, write_json
 from vdgs.system.console import show_share
 from vdgs.system.documents import JsonObject
+from vdgs.visibility.visibility_counts import NearbyCameras
 
 #: Photographs that the picture for people shows, those of which most moves, and the width of each.
 EXAMPLES, EXAMPLE_WIDTH_PX = 6, 480
@@ -55,6 +57,8 @@ def find_run_motion(context: RunContext, console: Console, device: str = "cpu") 
         shutil.rmtree(run.motion_file.parent, ignore_errors=True)
         return
     if has_motion_record(run):
+        if asked == "auto":
+            _drop_needless_masks(context)
         console.print(f"{run.motion_file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
@@ -62,18 +66,40 @@ def find_run_motion(context: RunContext, console: Console, device: str = "cpu") 
         check_has_anchors(run, len(opened.model.anchors))
         StageFolder(run.motion_file.parent).reset_unless(key)
         search = _MotionSearch(opened, run.motion_file.parent, context, console)
-        sample = spread_evenly(opened.capture.train_views, SAMPLED_PHOTOGRAPHS) if asked == "auto" else ()
-        share = search.share_of(sample) if sample else 1.0
-        record: JsonObject = {"key": key, "masked": share >= MIN_MOVING_SHARE, "share": share, "photographs": []}
+        sample = spread_evenly(opened.capture.train_views, SAMPLED_PHOTOGRAPHS)
+        share = search.share_of(sample)
+        enough = share >= MIN_MOVING_SHARE  # what `auto` goes by, whoever asks
+        record: JsonObject = {
+            "key": key, "masked": enough or asked == "on", "share": share, "photographs": [],
+            "enough": enough, "sampled": len(sample), "sampled_share": share,
+        }  # fmt: skip
         if record["masked"]:
             record |= {"share": search.share_of(opened.capture.train_views), "photographs": search.records()}
             _write_examples(run.path / MOTION_EXAMPLES, opened.capture.train_views, search.records(), search.folder)
         else:
-            record["sampled"] = len(sample)
-            search.remove_masks()
+            _remove_masks(search.folder, search.records())
         write_json(run.motion_file, record)
         shutil.rmtree(search.folder / "residuals", ignore_errors=True)
     _tell(record, run.path / MOTION_EXAMPLES, console)
+
+
+def _drop_needless_masks(context: RunContext) -> None:
+    """Delete masks that `on` asked for and `auto` does not."""
+    run, record = context.run, read_json(context.run.motion_file)
+    if not record["masked"] or moves_enough(record):
+        return
+    with run.locked():
+        photographs, share = record["photographs"], record["sampled_share"]
+        write_json(run.motion_file, record | {"masked": False, "share": share, "photographs": []})
+        _remove_masks(run.motion_file.parent, photographs)
+        (run.path / MOTION_EXAMPLES).unlink(missing_ok=True)
+
+
+def _remove_masks(folder: Path, records: Sequence[JsonObject]) -> None:
+    """Delete the masks of these photographs."""
+    for record in records:
+        if record["mask"] is not None:
+            (folder / record["mask"]).unlink(missing_ok=True)
 
 
 def _tell(record: JsonObject, examples: Path, console: Console) -> None:
@@ -109,7 +135,8 @@ class _MotionSearch:
 
     def share_of(self, views: Sequence[View]) -> float:
         """The mean share of the photographs' pixels that moves; writes their masks."""
-        known, cameras = self._opened.capture.train_views, [view.camera for view in self._opened.capture.train_views]
+        known = self._opened.capture.train_views
+        cameras = NearbyCameras([view.camera for view in known])
         names = {view.name for view in views}
         chosen = [index for index, view in enumerate(known) if view.name in names]
         step = self._context.run.begin_step("coarse", "looking for what moves", "photographs", len(chosen))
@@ -117,7 +144,7 @@ class _MotionSearch:
             for number, index in enumerate(chosen, start=1):
                 if index not in self._found:
                     own = self._residual(index)
-                    others = [self._residual(other) for other in overlapping_views(index, cameras, own.depth)]
+                    others = [self._residual(other) for other in overlapping_views(index, own, cameras)]
                     self._found[index] = _mask_view(self._opened, index, moving_pixels(own, others), self.folder)
                 show(number, len(chosen))
                 step(number)
@@ -127,11 +154,6 @@ class _MotionSearch:
     def records(self) -> list[JsonObject]:
         """What was found in each training photograph."""
         return [self._found[index] for index in sorted(self._found)]
-
-    def remove_masks(self) -> None:
-        for record in self.records():
-            if record["mask"] is not None:
-                (self.folder / record["mask"]).unlink(missing_ok=True)
 
     def _residual(self, index: int) -> Residual:
         view, file = self._opened.capture.train_views[index], self.folder / "residuals" / f"{index:05d}.npy"

@@ -138,10 +138,12 @@ def partition_run(
             key=keys.partition, assignment_key=keys.assignment, strategy=method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             warnings=tuple(warnings), assignment_warnings=tuple(assignment.warnings), blocks=tuple(rows),
-            spatial_only_blocks=block_rows(spatial, scene.positions, scene.visibility),
+            spatial_only_blocks=(
+                () if spatial is None else block_rows(spatial, scene.positions, scene.visibility)
+            ),
             seconds=time.monotonic() - start, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
-        write_json(run.partition / "partition.json", record_to_dict(record))  # last: the rest is complete
+        write_json(run.partition_file, record_to_dict(record))  # last: the rest is complete
         if is_distributed:
             remove(job.folder)
     console.print(make_assignment_table(rows))
@@ -159,10 +161,10 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     console.print(table)
 
 
-def _spatial(scene: _Scene, config: PartitionConfig, seed: int, blocks: Blocks) -> Blocks:
-    """The blocks that positions alone would give, to compare with."""
-    if config.lambda_vis == 0 or len(blocks) == 1:
-        return blocks
+def _spatial(scene: _Scene, config: PartitionConfig, seed: int, blocks: Blocks) -> Blocks | None:
+    """The blocks that positions alone would give, to compare with; None where visibility has no part in the cut."""
+    if config.strategy != "visibility" or config.lambda_vis == 0 or len(blocks) == 1:
+        return None
     config = replace(config, blocks=len(blocks), lambda_vis=0.0)
     return partition_scene(scene.positions, scene.visibility, config, seed)[0]
 
@@ -235,10 +237,8 @@ def describe_partition(config: PartitionConfig) -> str:
 
 def _draw(
     folder: Path, scene: _Scene, blocks: Blocks, scores: ScoreMatrix, assignment: Assignment, config: PartitionConfig,
-    spatial: Blocks,
+    compare: Blocks | None,
 ) -> None:  # fmt: skip
-    uses_visibility = config.strategy == "visibility" and config.lambda_vis > 0
-    compare = spatial if uses_visibility and len(blocks) > 1 else None
     partitions = [(describe_partition(config), blocks)]
     partitions += [] if compare is None else [(figures.SPATIAL_ONLY_LABEL, compare)]
     figures.plot_blocks(

@@ -54,6 +54,7 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     """
     check_backend_reachable(request.executor_options)
     check_ranges(request)
+    request.checkpointing.check()
     check_weights_file(request.lpips_weights)
     check_output(request.output)
     RunFolder(request.output).check_output_empty()

@@ -145,12 +145,13 @@ def plan_block(
     crops and what finds them."""
     views = [capture.train_views[i] for i in indices]
     cameras = [view.camera for view in views]
-    own, around = split_trainable_anchors(coarse.anchors, blocks, index, method.block)
+    owner = blocks.owner(xy_positions(coarse.anchors.positions))
+    own, around = split_trainable_anchors(coarse.anchors, blocks, index, method.block, owner)
     around &= visible_anchors(coarse.anchors, cameras)
     anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
     config, weights, crops = block_train_config(method, len(views)), None, None
     if views and len(anchors):
-        owned = np.bincount(blocks.owner(xy_positions(coarse.anchors.positions)), minlength=len(blocks))
+        owned = np.bincount(owner, minlength=len(blocks))
         limit = max_block_anchors(method.block, int(owned[index]), int(owned.sum()))
         config = replace(config, densify=replace(config.densify, max_anchors=limit))
         weights = view_sampling_weights(config, anchors, cameras)
@@ -203,9 +204,10 @@ def _train(
 
 
 def keep_coarse_block(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:
-    """A block that cannot be trained keeps what the coarse model has there, and says why."""
+    """A block that cannot be trained keeps what the coarse model has there, in one exposure as all blocks are, and says
+    why."""
     why = "no camera sees it" if not views else "it holds no anchor"
-    model.save(folder.model)
+    model.without_local_exposure().save(folder.model)
     status = StatusRecord(
         state="done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, reason=why,
         model_id=file_id(folder.model),

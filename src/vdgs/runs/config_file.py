@@ -38,7 +38,9 @@ def setting_flag(setting: str) -> str:
 
 
 def changed_flags(old: RunSettings, new: RunSettings, sections: Sequence[str] = SECTIONS) -> list[str]:
-    """The options that differ between the settings of two runs, a line each; the path of the capture is none."""
+    """The options that differ between the settings of two runs, a line each; the path of the capture is none, nor are
+    those of files in it."""
+    old = old.moved(Path(new.capture_path))
     before, after = ({name: each.to_dict()[name] for name in sections} for each in (old, new))
     lines = [line.partition(": ") for line in diff_settings(before, after) if not line.startswith("capture.path: ")]
     return [f"{setting_flag(path)}: {values}" for path, _, values in lines]

@@ -101,8 +101,7 @@ def _resume(
 
 def capture_options_changed(run: RunFolder, settings: RunSettings) -> bool:
     """Whether the run reads its capture with other options: a difference of captures is due to these then."""
-    before, now = (each.capture for each in (run.settings(), settings))
-    return before != now
+    return run.settings().moved(Path(settings.capture_path)).capture != settings.capture
 
 
 def _copy_reconstruction(root: Path, run: Path) -> None:

@@ -35,6 +35,6 @@ def lod_status(run: RunFolder, status: RunStatus) -> tuple[StageStatus, ...]:
         state, reason = "stale", "made by another version of vdgs"
     elif state == "stopped" and is_known_locked(folder.path):
         state, reason = "running", ""
-    of_coarse = found.model_id == coarse and merged is not None
+    of_coarse = found.model_id == coarse and bool(merged)
     command = f"vdgs lod {shell_word(run.path)}" + (" --model coarse" if of_coarse else "")
     return (StageStatus(name="lod", state=state, folder="lod", reason=reason, status=found, command=command),)

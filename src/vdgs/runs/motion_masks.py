@@ -1,7 +1,8 @@
 """Masks of what moves, which a run makes after its coarse stage (`--block.mask-moving`). Its blocks train with them,
 and maps take detail by them; test views are measured whole.
 
-RUN/coarse/motion/  key, motion.json (share and mask of each training photograph, or how little moves in a sample),
+RUN/coarse/motion/  key, motion.json (share and mask of each training photograph, or how little moves in a sample;
+                    whether that is enough for `auto`),
                     NNNNN.png (white = keep, the capture's own mask included), examples.png
 """
 

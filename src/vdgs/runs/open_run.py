@@ -162,8 +162,8 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
 
     Raises CaptureError if it is gone or changed its form.
     """
-    settings = folder.settings()
-    path = at or Path(settings.capture_path)
+    settings = folder.settings() if at is None else folder.settings().moved(at)
+    path = Path(settings.capture_path)
     if at is None and not path.exists():
         raise CaptureError(
             f"{path}: the capture of {folder.path} is not there. If it was moved, say where to, once: "

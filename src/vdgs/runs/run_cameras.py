@@ -64,7 +64,7 @@ def save_run_cameras(run: RunFolder, capture: Capture) -> None:
             "ground_frame": {
                 "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
                 "metric": ground.metric, "how": ground.description, "origin_geo": ground.origin_geo,
-                "axes_geo": ground.axes_geo,
+                "axes_geo": ground.axes_geo, "accuracy": ground.accuracy, "method": ground.method,
             },
             "middle": np.median(capture.points, axis=0).tolist(),
             "camera_height": camera_height(capture),
@@ -112,11 +112,12 @@ def _relative_to(root: Path, folder: Path) -> str:
 
 def _ground_from_dict(frame: JsonObject) -> GroundFrame:
     rotation, translation = (np.array(frame[name], np.float64) for name in ("rotation", "translation"))
-    scale, metric, geo = float(frame["scale"]), bool(frame["metric"]), frame["origin_geo"]
-    axes = frame.get("axes_geo")  # older runs have none
+    # What older versions did not write has its default.
+    origin, axes = (None if geo is None else tuple(geo) for geo in (frame["origin_geo"], frame.get("axes_geo")))
     return GroundFrame(
-        scale=scale, rotation=rotation, translation=translation, metric=metric, description=str(frame["how"]),
-        origin_geo=None if geo is None else tuple(geo), axes_geo=None if axes is None else tuple(axes),
+        scale=float(frame["scale"]), rotation=rotation, translation=translation, metric=bool(frame["metric"]),
+        description=str(frame["how"]), origin_geo=origin, axes_geo=axes,
+        accuracy=str(frame.get("accuracy", "")), method=str(frame.get("method", "")),
     )  # fmt: skip
 
 

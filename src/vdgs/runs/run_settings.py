@@ -49,6 +49,16 @@ class RunSettings:
         """All but the capture."""
         return MethodConfig(**{name: getattr(self, name) for name in SECTIONS[1:]})
 
+    def moved(self, to: Path) -> RunSettings:
+        """The settings for the same capture at another place, where the files lie too that options name inside it."""
+        before = Path(self.capture_path)
+        inside: dict[str, Any] = {
+            name: to / path.relative_to(before)
+            for name, path in vars(self.capture).items()
+            if isinstance(path, Path) and path.is_relative_to(before)
+        }
+        return replace(self, capture_path=str(to), capture=replace(self.capture, **inside))
+
     def to_dict(self) -> dict[str, Any]:
         """As config.yaml holds it."""
         return {"capture": {"path": self.capture_path} | to_dict(self.capture)} | to_dict(self.method)

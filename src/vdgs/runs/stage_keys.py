@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vdgs.runs.run_settings import RunSettings
@@ -40,12 +41,18 @@ class StageKeys:
 
 
 def stage_keys(
-    settings: RunSettings, coarse_model: str | None = None, motion: Mapping[str, Any] | None = None
+    settings: RunSettings,
+    coarse_model: str | None = None,
+    motion: Mapping[str, Any] | None = None,
+    made: Mapping[str, str | None] | None = None,
 ) -> StageKeys:
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
     (`coarse_model`): trained again on another machine it may differ in its last bits. `motion` is the record of what
-    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not."""
-    keys, plain = dict[str, str](), settings.to_dict()
+    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not. `made` are the
+    keys of the coarse model and of the cut that are there: those of older versions stand, which held absolute paths of
+    files in the capture, and did not tell what an automatic number of blocks followed from."""
+    keys, made = dict[str, str](), made or {}
+    plain, placed = settings.moved(Path()).to_dict(), settings.to_dict()
     for stage, (sections, before) in STAGE_DEPENDENCIES.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
         own: dict[str, Any] = {name: hashable_settings(name, plain[name]) for name in sections}
@@ -55,14 +62,43 @@ def stage_keys(
         if stage == "merge" and not settings.training.exposure_compensation:
             del own["merge"]["reference_exposure"]  # there is none, and runs of before stay as they are
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
-        keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+        keys[stage] = _digest(content)
+        if stage == "coarse":
+            older = _digest([own | {"capture": hashable_settings("capture", placed["capture"])}])
+            keys[stage] = older if made.get(stage) == older else keys[stage]
+        if stage == "partition" and settings.partition.blocks == "auto" and made.get(stage) != keys[stage]:
+            keys[stage] = _digest([*content, block_count_settings(settings)])
     return StageKeys(**keys)
 
 
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def block_count_settings(settings: RunSettings) -> dict[str, Any]:
+    """What the number of blocks follows from with `--blocks auto`, of the settings of blocks: what makes their training
+    take more memory (`memory_estimate.block_workload`)."""
+    block, compensation = settings.block, settings.block.compensation
+    return {
+        "is_margin_trained": block.margin != "frozen",
+        "max_anchors": [block.densify.max_anchors, block.max_anchors_total],
+        "has_swa": block.swa_fraction > 0,
+        "is_compensated": compensation.enabled,
+        "has_fixed_threshold": compensation.enabled and not compensation.t_low_quantile,
+        "downscale": min(factor for _, factor in block.resolution_schedule),
+    }
+
+
 def leaves_out_motion(settings: RunSettings, visibility_key: str, motion: Mapping[str, Any]) -> bool:
-    """Whether the blocks are trained with masks of what moves: with `auto`, where the record finds enough."""
+    """Whether the blocks are trained with masks of what moves: with `auto`, where a sample of the record has enough."""
     asked = settings.block.mask_moving
-    return asked == "on" or (asked == "auto" and motion.get("key") == visibility_key and bool(motion.get("masked")))
+    return asked == "on" or (asked == "auto" and motion.get("key") == visibility_key and moves_enough(motion))
+
+
+def moves_enough(motion: Mapping[str, Any]) -> bool:
+    """Whether `auto` masks what moves by this record, which `on` may have asked for. (Older versions recorded only
+    whether there are masks.)"""
+    return bool(motion.get("enough", motion.get("masked")))
 
 
 def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:

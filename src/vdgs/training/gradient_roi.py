@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import ALPHA_MIN, SSIM_WINDOW_PX
-from vdgs.kernels.kernel_types import Splats
+from vdgs.kernels.kernel_types import Splats, TrainingSplats
 from vdgs.training.crops import FULL_AREA_FRACTION, PixelBox
 from vdgs.training.training_state import TrainingProblem
+from vdgs.training.training_step import with_opacity_factors
 
 #: A pixel is in windows of SSIM around others, which look as far again.
 MARGIN_PX = SSIM_WINDOW_PX - 1
@@ -18,14 +21,20 @@ MARGIN_PX = SSIM_WINDOW_PX - 1
 SLACK_PX = 1.0
 
 
-def crop_to_gradient_support(stage: TrainingProblem, splats: Splats, camera: Camera, box: PixelBox) -> PixelBox:
-    """The part of a box of a view, which `camera` shows, that gives the same gradients of a block's splats but for
-    rounding. The means of the splats are shifted to pixels of the part, in place. On a GPU the whole box: computing the
-    part would wait for the GPU."""
+def crop_to_gradient_support(
+    stage: TrainingProblem,
+    splats: TrainingSplats,
+    camera: Camera,
+    box: PixelBox,
+    opacity_factors: Float[Tensor, " m"] | None = None,
+) -> PixelBox:
+    """The part of a box of a view, which `camera` shows, that gives the same gradients of a block's splats, with their
+    opacities multiplied by factors, but for rounding. The means of the splats are shifted to pixels of the part, in
+    place. On a GPU the whole box: computing the part would wait for the GPU."""
     frozen = stage.frozen_anchors
     if frozen is None or not len(frozen.anchors) or stage.device.type != "cpu":
         return box
-    part = splat_roi(splats, camera)
+    part = splat_roi(with_opacity_factors(splats, opacity_factors), camera)
     if part is None:
         return box
     left, top, right, bottom = part

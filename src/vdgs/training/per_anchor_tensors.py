@@ -35,6 +35,11 @@ def index_anchors(state: PerAnchorTensors, added: Mapping[str, TensorGroup], cou
     state.put_groups(groups)
 
 
+def without_rows(groups: Mapping[str, TensorGroup]) -> dict[str, TensorGroup]:
+    """The same groups of tensors without rows, for a state whose tensors are taken: a slice would keep their memory."""
+    return {name: {key: t.new_empty(0, *t.shape[1:]) for key, t in group.items()} for name, group in groups.items()}
+
+
 def index_rows(group: TensorGroup, added: Mapping[str, Tensor], kept: Tensor) -> None:
     """Append to each tensor the rows of its name in `added`, then keep the `kept` rows (mask or order); in place.
 

@@ -86,7 +86,8 @@ def warp_photograph(
     target: TrainingTarget, shown: Raster, camera: Camera, raster: Raster, camera_height: float
 ) -> TrainingTarget | None:
     """What a pseudo view, drawn as `raster`, should show by a photograph whose view was drawn as `shown`, both with
-    depth; None where the photograph sees too little of it."""
+    depth; None where the photograph sees too little of it. Near a part of a photograph, gradients are multiplied by the
+    part's share of the area: a pixel of a pseudo view weighs as much as near the whole."""
     assert raster.median_depth is not None
     assert shown.median_depth is not None
     depth = raster.median_depth
@@ -102,7 +103,9 @@ def warp_photograph(
     colors = target.image.to(depth).permute(2, 0, 1)[None]
     warped = grid_sample(colors, grid, align_corners=False, padding_mode="border")[0].permute(1, 2, 0)
     image = warped.round_().clamp_(0, 255).to(torch.uint8).contiguous()
-    return TrainingTarget(image=image, mask=counts.to(torch.uint8), camera=camera, valid_fraction=share)
+    whole_width, whole_height = target.camera.full_size
+    part = target.camera.width * target.camera.height / (whole_width * whole_height)
+    return TrainingTarget(image=image, mask=counts.to(torch.uint8), camera=camera, valid_fraction=share * part)
 
 
 def _places_in(seen: Camera, camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:

@@ -22,7 +22,7 @@ ALL_LEVELS_SHARE = 0.5
 def mean_image_color(
     images: TrainingImages, count: int, downscale: int, max_images: int = 32
 ) -> tuple[float, float, float]:
-    """Mean color in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
+    """Mean color in [0, 1] of the pixels that count, over up to `max_images` evenly chosen training views."""
     total, pixels = np.zeros(3), 0
     for index in np.unique(np.linspace(0, count - 1, min(count, max_images)).astype(int)):
         image, mask = images.get(int(index), downscale)

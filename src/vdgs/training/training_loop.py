@@ -98,11 +98,14 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     background, with_pseudo_view = background_at(stage, iteration), is_pseudo_view_due(config, iteration)
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
-        target = make_target(stage, view, downscale, crop_to_gradient_support(stage, splats, camera, box))
+        factors = opacity_factors_at(stage, iteration, len(splats.source))
+        if not with_pseudo_view:  # which begins at any place of the box, on any device
+            box = crop_to_gradient_support(stage, splats, camera, box, factors)
+        target = make_target(stage, view, downscale, box)
         frozen = _frozen_splats(stage, view, camera, target.camera, iteration)
         drawn = render_for_training(
             splats, target.camera, background, frozen, depth=with_pseudo_view or is_agreement_due(config, iteration),
-            opacity_factors=opacity_factors_at(stage, iteration, len(splats.source)),
+            opacity_factors=factors,
         )  # fmt: skip
     drawn = with_sky(drawn, stage, view, state.decoder, target.camera, background)
     weight = stage.loss_weight

@@ -23,7 +23,7 @@ from vdgs.training.compensation import CompensationState
 from vdgs.training.crops import Crop
 from vdgs.training.exposure_centering import ExposureMoments, zero_moments
 from vdgs.training.optimizer import AdamMoments, AnchorOptimizer
-from vdgs.training.per_anchor_tensors import TensorGroup
+from vdgs.training.per_anchor_tensors import TensorGroup, without_rows
 from vdgs.training.weight_averaging import ModelAverage
 
 #: What is trained: the whole scene, or one block of it.
@@ -101,7 +101,7 @@ class TrainingState:
     def take_groups(self) -> dict[str, TensorGroup]:
         """`groups`, which the state no longer holds: see `index_anchors`."""
         groups = {name: dict(group) for name, group in self.groups().items()}
-        self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
+        self.put_groups(without_rows(groups))
         return groups
 
     def put_groups(self, groups: dict[str, TensorGroup]) -> None:

@@ -49,7 +49,7 @@ class RenderedTrainingView:
     pullback: RasterPullback
     #: With depth, where it was asked for.
     raster: Raster
-    #: By what opacities were multiplied; None: by nothing.
+    #: By what opacities were multiplied, 0 where they reached their limit; None: by nothing.
     opacity_factors: Float[Tensor, " m"] | None = None
     #: What the gradients of means_px and conics of these splats may overwrite.
     scratch: tuple[Tensor, Tensor]
@@ -72,16 +72,22 @@ class RenderedTrainingView:
         )  # fmt: skip
 
 
+def with_opacity_factors(splats: TrainingSplats, factors: Float[Tensor, " m"] | None) -> TrainingSplats:
+    """The splats with their opacities multiplied, at most full: there the rasterizer's own limit holds."""
+    if factors is None:
+        return splats
+    return replace(splats, opacities=(splats.opacities * factors).clamp_(max=1.0))
+
+
 @torch.no_grad()
 def render_for_training(
     splats: TrainingSplats, camera: Camera, background: Float[Tensor, "3"], frozen_splats: OrderedSplats | None = None,
     *, depth: bool = False, opacity_factors: Float[Tensor, " m"] | None = None,
 ) -> RenderedTrainingView:  # fmt: skip
     """Draw the splats of trained anchors with `frozen_splats`. The returned view reuses the memory of `splats`."""
-    shown = splats
-    if opacity_factors is not None:
-        # At full opacity the rasterizer's own limit holds.
-        shown = replace(splats, opacities=(splats.opacities * opacity_factors).clamp_(max=1.0))
+    shown = with_opacity_factors(splats, opacity_factors)
+    if opacity_factors is not None:  # what is limited follows its opacity no more
+        opacity_factors = opacity_factors * (splats.opacities * opacity_factors <= 1.0)
     m, drawn = len(splats.source), shown if frozen_splats is None else shown.concat(frozen_splats)
     kernels = get_backend(drawn.means_px.device)
     raster, pullback = kernels.rasterize_vjp(drawn, background, camera.width, camera.height, depth=depth)

@@ -63,7 +63,7 @@ class NearbyCameras:
     """Which of many cameras may see some places, or fade them out: of a scene's part few do, and V asks no others."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
-        self._cameras = list(cameras)
+        self.cameras = list(cameras)
         self._is_pinhole = np.array([each.model == "pinhole" for each in cameras], bool)
         poses = np.array([each.camera_from_world for each in cameras]).reshape(-1, 4, 4)
         lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras]).reshape(-1, 6).T
@@ -73,7 +73,11 @@ class NearbyCameras:
 
     def of(self, positions: Float[Tensor, "p 3"]) -> list[Camera]:
         """Those whose pictures, widened by `FADE_MARGIN`, reach the sphere about these places; others count none."""
-        return [self._cameras[k] for k in self._reached(*_sphere(positions))] if len(positions) else []
+        return [self.cameras[k] for k in self.indices(positions)]
+
+    def indices(self, positions: Float[Tensor, "p 3"]) -> Int[np.ndarray, " near"]:
+        """The numbers of those cameras, ascending."""
+        return self._reached(*_sphere(positions)) if len(positions) else np.zeros(0, np.int64)
 
     def fade_factors(self, positions: Float[Tensor, "p 3"], min_visibility: int) -> Float[Tensor, " p"]:
         """`fade_factors` of all the cameras. Where too few reach the sphere about the places, or enough of them hold
@@ -87,12 +91,12 @@ class NearbyCameras:
         hold = self._is_pinhole[near] & (_least_distances(self._planes[:, near], center) > radius)
         if hold.sum() >= min_visibility:
             return positions.new_ones(len(positions))
-        return fade_factors(positions, [self._cameras[k] for k in near], min_visibility)
+        return fade_factors(positions, [self.cameras[k] for k in near], min_visibility)
 
     def _reached(self, center: Float[np.ndarray, "3"], radius: float) -> Int[np.ndarray, " near"]:
         """The numbers of the cameras whose widened pictures reach a sphere."""
         if not np.isfinite(radius):
-            return np.arange(len(self._cameras))
+            return np.arange(len(self.cameras))
         return np.flatnonzero(~self._is_pinhole | (_least_distances(self._widened, center) >= -radius))
 
 

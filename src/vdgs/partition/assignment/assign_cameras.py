@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int8, Int64
 from rich import box
 from rich.table import Table
 
@@ -19,7 +19,7 @@ from vdgs.config.method import AssignmentConfig
 from vdgs.errors import RunError
 from vdgs.partition.assignment.score_matrix import ScoreMatrix
 from vdgs.partition.block_records import BlockCamerasRecord, BlockRecord
-from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.partition.blocks import Blocks, rows_by_owner, xy_positions
 
 #: What the numbers in `Assignment.reasons` mean.
 NOT_ASSIGNED, ABOVE_THRESHOLD, BEST_BLOCK, TOPPED_UP = range(4)
@@ -146,14 +146,19 @@ def block_rows(
     blocks: Blocks, positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"]
 ) -> tuple[BlockRecord, ...]:
     """Anchors, area and visibility of each block of a cut."""
-    owner = blocks.owner(xy_positions(positions))
+    return _block_rows(blocks, blocks.owner(xy_positions(positions)), visibility)
+
+
+def _block_rows(
+    blocks: Blocks, owner: Int64[np.ndarray, " n"], visibility: Int[np.ndarray, " n"]
+) -> tuple[BlockRecord, ...]:
+    seen = [visibility[rows] for rows in rows_by_owner(owner, len(blocks))]
     return tuple(
         BlockRecord(
-            index, int((owner == index).sum()), float(block.core.area),
-            mean_v=float(visibility[owner == index].mean()) if (owner == index).any() else None,
-            std_v=float(visibility[owner == index].std()) if (owner == index).any() else None,
+            index, len(views), float(block.core.area),
+            mean_v=float(views.mean()) if len(views) else None, std_v=float(views.std()) if len(views) else None,
         )
-        for index, block in enumerate(blocks.items)
+        for index, (block, views) in enumerate(zip(blocks.items, seen, strict=True))
     )  # fmt: skip
 
 
@@ -171,7 +176,7 @@ def assignment_rows(
             topped_up=int(np.count_nonzero(reasons == TOPPED_UP)),
             anchors_expanded=int(np.count_nonzero(blocks.in_expanded(row.block, points, owner))),
         )
-        for row, reasons in zip(block_rows(blocks, positions, visibility), assignment.reasons.T, strict=True)
+        for row, reasons in zip(_block_rows(blocks, owner, visibility), assignment.reasons.T, strict=True)
     ]  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.partition.blocks import Blocks, rows_by_owner, xy_positions
 from vdgs.partition.plots.block_colors import block_color
 from vdgs.system.figure_style import INK, MUTED, draw_titles, new_figure, pluralize, style_axes, write_png
 
@@ -94,10 +93,7 @@ def compute_block_stats(
 ) -> BlockStats:
     """What a cut gives each block, without cameras; `visibility` are the V of the anchors."""
     owner = blocks.owner(xy_positions(positions))
-    # Sorted once: looked up for each block, thousands of blocks would take longer than their cut.
-    order = np.argsort(owner, kind="stable")
-    bounds = np.searchsorted(owner[order], np.arange(len(blocks) + 1))
-    seen = [visibility[order[begin:end]] for begin, end in pairwise(bounds)]
+    seen = [visibility[rows] for rows in rows_by_owner(owner, len(blocks))]
     nothing = (np.nan,) * 4
     of_views = np.array(
         [(v.mean(), *np.quantile(v, (0.05, 0.95)), v.std()) if len(v) else nothing for v in seen], np.float64

@@ -54,6 +54,8 @@ class TrainingWorkload:
     surroundings: int = 0
     #: Whether training ends with a mean of models, which is kept beside the grown anchors.
     has_swa: bool = False
+    #: Whether growth is compensated, for which gradients of each Gaussian are remembered.
+    is_compensated: bool = False
     #: How many times their number anchors may become where nothing limits them: `max_growth_factor`.
     growth: float = MAX_GROWTH
 
@@ -127,14 +129,16 @@ def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixel
         image_cache_bytes=0,
         surroundings=total_anchors - moved,
         has_swa=block.swa_fraction > 0,
+        is_compensated=block.compensation.enabled,
         growth=max_growth_factor(block.compensation),
     )
 
 
-def bytes_per_anchor(offsets: int, seen: float) -> float:
-    """Parameters, two moments, a count of updates, a bound on size and statistics of an anchor, and its share of what a
-    step allocates for anchors in view."""
-    state = 3 * model_bytes_per_anchor(offsets) + 4 * (2 + 2 * offsets + 2)
+def bytes_per_anchor(offsets: int, seen: float, is_compensated: bool = False) -> float:
+    """Parameters, two moments, a count of updates, a bound on size and statistics of an anchor, what compensated growth
+    remembers, and its share of what a step allocates for anchors in view."""
+    remembered = 3 * offsets if is_compensated else 0
+    state = 3 * model_bytes_per_anchor(offsets) + 4 * (2 + 2 * offsets + 2 + remembered)
     return state + seen * STEP_BYTES_PER_OFFSET * offsets
 
 
@@ -146,14 +150,14 @@ def model_bytes_per_anchor(offsets: int) -> int:
 def _per_grown_anchor(need: TrainingWorkload) -> float:
     # A mean of models holds no positions, which never move.
     mean = model_bytes_per_anchor(need.offsets) - 4 * 3 if need.has_swa else 0
-    return bytes_per_anchor(need.offsets, need.seen) + mean
+    return bytes_per_anchor(need.offsets, need.seen, need.is_compensated) + mean
 
 
 def estimate_memory(need: TrainingWorkload) -> MemoryEstimate:
     """What training takes, at its start and once its anchors have grown."""
     in_view = need.seen * STEP_BYTES_PER_OFFSET * need.offsets
     frozen = need.surroundings * (model_bytes_per_anchor(need.offsets) + in_view)
-    start = bytes_per_anchor(need.offsets, need.seen) * need.anchors
+    start = bytes_per_anchor(need.offsets, need.seen, need.is_compensated) * need.anchors
     return MemoryEstimate(
         PROCESS_BYTES, need.image_cache_bytes, TRAIN_BYTES_PER_PIXEL * need.pixels,
         round(start + frozen), round(_per_grown_anchor(need) * need.max_grown_anchors + frozen),

@@ -48,6 +48,7 @@ def training_workload(state: TrainingState, stage: TrainingProblem) -> TrainingW
         image_cache_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.frozen_anchors is None else len(stage.frozen_anchors.anchors),
         has_swa=config.swa_fraction > 0,
+        is_compensated=config.compensation.enabled,
         growth=max_growth_factor(config.compensation),
     )
 

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import TrainConfig
-from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
@@ -149,8 +148,6 @@ def warn_without_densification(config: TrainConfig, console: Console, prefix: st
 def _board(folder: StageFolder, options: CheckpointOptions, iteration: int) -> Any:
     if not options.tensorboard:
         return None
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise VdgsError('TensorBoard is not installed: pip install "vdgs[tensorboard]"') from error
+    from torch.utils.tensorboard import SummaryWriter  # of an extra: `CheckpointOptions.check`
+
     return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration)
