@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from support.commands import wait_until
 from support.gaussians import overhead, picture, psnr, random_gaussians
@@ -87,6 +89,36 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
     with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
         wait_until(lambda: state(page) == "failed")
         assert "copy it whole" in page.evaluate("document.body.innerText")
+
+
+def test_a_view_is_drawn_as_finely_as_there_is_room_whatever_was_looked_at_before(tmp_path):
+    """Parts of a view take the place of those of earlier ones, not of each other."""
+    gaussians = random_gaussians(3000, 0)
+    spread = 1000 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 500
+    gaussians = replace(gaussians, means=spread * torch.tensor([1.0, 1.0, 0.01]))
+    view = InitialView((-250.0, -251.0, 300.0), (-250.0, -250.0, 0.0))
+    write_streamed_page(tmp_path / "scene.json", replace(ExportScene.of(gaussians), page=view), node_size=20)
+
+    def parts(page) -> int:
+        """How many are drawn of the 64 that there is room for, once all are loaded."""
+        wait_until(lambda: page.evaluate("document.body.dataset.state") == "complete")
+        found = re.search(r"(\d+) of", page.evaluate("document.getElementById('caption').textContent"))
+        return int(found[1]) if found else 0
+
+    def pan(page, key: str) -> int:
+        """Look at the next quarter of the scene, or beyond it."""
+        page.evaluate(
+            "document.body.dataset.state = ''; for (let i = 0; i < 10; i++) document.getElementById('canvas')"
+            f".dispatchEvent(new KeyboardEvent('keydown', {{key: 'Arrow{key}'}}))"
+        )
+        return parts(page)
+
+    with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
+        first = parts(page)
+        around = [pan(page, key) for key in ("Right", "Up", "Left", "Down")]
+        assert min(first, *around) > 20
+        assert around[-1] == first
+        assert [pan(page, key) for key in ("Down", "Up")] == [0, first]
 
 
 def test_a_page_that_was_opened_as_a_file_says_how_to_serve_it(tmp_path):

@@ -40,6 +40,22 @@ def test_opf_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> None
     assert (source.colors == flight.colors).all()
 
 
+@pytest.mark.parametrize("unit", [1.0, 0.3048])
+def test_the_geoid_of_opf_has_the_unit_of_its_heights(tmp_path: Path, flight: KnownFlight, unit: float) -> None:
+    writers.write_opf(tmp_path, flight, unit)
+    flight.write_photographs(tmp_path / "images")
+    frame, heights = tmp_path / "scene-reference-frame.json", []
+    content = json.loads(frame.read_text())
+    for geoid in (0.0, -100.0):
+        content["crs"]["geoid_height"] = geoid
+        frame.write_text(json.dumps(content))
+        georef = read(tmp_path, "opf").georef
+        assert georef is not None
+        assert georef.origin is not None
+        heights.append(georef.origin[2])
+    assert heights[1] - heights[0] == pytest.approx(-100 * unit, abs=1.0)  # origins are whole metres
+
+
 def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) -> None:
     writers.write_opf(tmp_path, flight)
     flight.write_photographs(tmp_path / "images")

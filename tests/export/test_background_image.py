@@ -14,6 +14,7 @@ from PIL import Image
 from support.hand_made_models import model_at
 from vdgs.errors import VdgsError
 from vdgs.export.background_image import check_background, write_background
+from vdgs.export.formats import registry
 
 PLAIN = model_at(np.zeros((1, 3)))
 
@@ -24,6 +25,7 @@ def test_the_middle_looks_east_and_the_right_half_south(tmp_path: Path) -> None:
     envmap[:8, :, 0], envmap[:, :, 1] = 1.0, torch.tensor([0.0, 0.25, 0.5, 0.75]).repeat_interleave(16)
     run = SimpleNamespace(model=replace(PLAIN, decoder=replace(PLAIN.decoder, envmap=envmap)))
     write_background(run, tmp_path / "sky.png")  # type: ignore[arg-type]
+    registry.check_ours(tmp_path / "sky.png")  # it may be written again
     picture = np.asarray(Image.open(tmp_path / "sky.png"))
     assert picture.shape == (1024, 2048, 3)
     north_east, south_east, south_west, north_west = (picture[300, k * 512 + 256, 1] for k in (1, 2, 3, 0))

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from support.hand_made_models import camera_above, model_at
 from vdgs.export import bake as bake_module
 from vdgs.export.bake import BakeContributions, bake, collect_contributions
-from vdgs.export.color_refinement import BakedGaussians, refine_colors
+from vdgs.export.bake_io import load_residual, save_residual
+from vdgs.export.color_refinement import MOST_PIXELS, BakedGaussians, refine_colors, view_residual
 from vdgs.export.formats.export_scene import ExportScene
 from vdgs.export.formats.gaussian_store import write_store
 from vdgs.export.gaussian_optimization import optimize_gaussians
@@ -204,6 +205,20 @@ def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
     # Nothing changes with the direction, so nothing is missing: what was left out is not painted onto what stays.
     assert (after.sh0 - before.sh0).abs().max() < 0.02
     assert np.array_equal(shown.rows_of_anchors(np.arange(len(model.anchors))), np.arange(len(part)))
+
+
+def test_a_gaussian_that_fills_a_large_photograph_keeps_its_color(tmp_path):
+    """More pixels than a float16 counts: what is saved of a view, in memory and in files, stays finite."""
+    seen = collect_contributions(model_at(scattered()), GRID)
+    shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path)
+    large = GRID[4].resized(64 * GRID[4].width, 64 * GRID[4].height)
+    view = view_residual(shown, large)
+    save_residual(tmp_path / "view.npy", view)
+    assert view.pixels.max() == load_residual(tmp_path / "view.npy").pixels.max() == MOST_PIXELS
+    refine_colors(shown, [large])
+    after = shown.spool.rows(np.arange(len(shown.spool.means)))
+    assert torch.isfinite(after.sh0).all()
+    assert torch.isfinite(after.shN).all()
 
 
 def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):

@@ -21,7 +21,7 @@ from vdgs.errors import VdgsError
 from vdgs.export import local_bake
 from vdgs.export.bake import collect_contributions
 from vdgs.export.export_run import RECORD_FILE, export_run, resolve_request
-from vdgs.export.formats import registry
+from vdgs.export.formats import html, registry
 from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, make_local_frame
 from vdgs.export.programs import PROGRAMS
 from vdgs.geometry.camera import Camera
@@ -278,6 +278,10 @@ def test_fewer_gaussians_are_merged_and_moved_not_dropped(export, tmp_path: Path
         ((), {}, "--output FILE"),
         (("scene.obj",), {}, "no format is known"),
         (("a.ply", "a.ply"), {}, "given twice"),
+        (("a.ply", "run/../a.ply"), {}, "given twice"),
+        (("web/scene.json", "web/index.html"), {}, r"index.html and --output .*scene.json: both write"),
+        (("web/index.html", "run/../web/scene.json"), {}, r"scene.json and --output .*index.html: both write"),
+        (("a.ply", "page.html"), {"html_max_mb": 5.0}, "A page of 5 MB has no room.*client alone takes 6.0 MB"),
         (("run/report.html",), {}, "is the report of the run"),
         (("a.ply", "run/../run/report.html"), {}, "is the report of the run"),
         (("a.ply",), {"bbox": (50.0, 50.0, 60.0, 60.0)}, "lies within"),
@@ -291,9 +295,26 @@ def test_what_cannot_be_written_is_said_before_anything_is_baked(
     export, tmp_path: Path, monkeypatch, names, asked, said
 ):
     monkeypatch.setattr(local_bake, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(html, "_frame_bytes", lambda: 6_000_000)
     with pytest.raises(VdgsError, match=said):
         export(*names, **asked)
     assert not list(tmp_path.glob("*.ply"))
+
+
+def test_a_background_is_an_output_like_the_others(export, tmp_path: Path, monkeypatch):
+    """No picture of others is overwritten, nor a link replaced, nor a folder found locked after the work."""
+    monkeypatch.setattr(local_bake, "bake", lambda *_: pytest.fail("baked"))
+    (tmp_path / "mine.png").write_bytes(b"\x89PNG of somebody")
+    (tmp_path / "link.png").symlink_to("elsewhere.png")
+    (tmp_path / "file").touch()
+    plain = scattered()
+    model = replace(plain, decoder=replace(plain.decoder, envmap=torch.zeros(16, 64, 3)))
+    for name, said in (
+        ("mine.png", "not written by vdgs"), ("link.png", "is a link"), ("file/sky.png", "file"),
+    ):  # fmt: skip
+        with pytest.raises(VdgsError, match=said):
+            export("a.ply", model=model, background=tmp_path / name)
+    assert (tmp_path / "mine.png").read_bytes() == b"\x89PNG of somebody"
 
 
 def looking_down_at(monkeypatch: pytest.MonkeyPatch, *x: float) -> None:

@@ -106,6 +106,12 @@ def test_an_spz_is_what_niantics_code_reads(tmp_path, version, degree):
     torch.testing.assert_close(ours.shN, theirs.shN, atol=1e-5, rtol=0)
 
 
+def test_an_spz_of_a_higher_degree_than_ours_is_not_called_damaged(tmp_path):
+    data = spz.HEADER_STRUCT.pack(spz.MAGIC, 3, 0, 4, 12, 0, 0)
+    with pytest.raises(VdgsError, match="degree 4, and vdgs reads those up to 3"):
+        list(spz.decode_spz(data, tmp_path / "a.spz"))
+
+
 def test_axes_named_anew_give_the_same_shapes_with_small_turns():
     some = random_gaussians(500, 0)
     some = replace(some, quaternions=torch.nn.functional.normalize(some.quaternions, dim=-1))

@@ -166,7 +166,9 @@ def film_of_noise(file: Path, frames: int, encoder: Encoder) -> None:
 
 
 def test_what_a_killed_film_left_goes(tmp_path: Path):
-    (tmp_path / ".film.mp4.999999999.partial.mp4").write_bytes(b"half")
+    left = tmp_path / ".film.mp4.999999999.partial.mp4"
+    left.write_bytes(b"half")
+    os.utime(left, (0, 0))
     mine = tmp_path / f".film.mp4.{os.getpid()}.partial.png"
     mine.write_bytes(b"mine")
     with VideoWriter(tmp_path / "film.mp4", 30.0, "mpeg4") as film:

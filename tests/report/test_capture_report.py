@@ -17,9 +17,11 @@ from rich.console import Console
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
 from vdgs.captures.place_record import place_rows
+from vdgs.captures.validation import validate_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.similarity import sample_points
 from vdgs.report.capture_report import inspect_capture, print_report
+from vdgs.report.capture_stats import measure_capture
 from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import count_visibility, visibility_stats
 
@@ -75,6 +77,16 @@ def test_photographs_that_are_shrunk_are_said_to_be(capture, tmp_path):
     assert ("Pixel of the photographs", "26.2 cm on the ground (images with --downscale 1.5, as used)") in place_rows(
         replace(report.place, unit="m", ground_sampling_distance=0.262)
     )
+
+
+def test_the_spacing_is_that_of_all_points_whatever_is_looked_at(capture):
+    """A sample lies as much farther apart as it is thinner."""
+    x, y = np.meshgrid(np.arange(40.0), np.arange(40.0))
+    grid = np.stack([x.ravel(), y.ravel(), np.zeros(1600)], axis=1)
+    dense = replace(capture, points=grid, point_colors=np.zeros((1600, 3), np.uint8))
+    some = grid[::37]
+    report = measure_capture(dense, some, np.full(len(some), 5), validate_capture(dense), None)
+    assert report.point_spacing == pytest.approx(1.0)
 
 
 def test_in_a_run_it_gets_a_folder_of_its_own(capture, tmp_path):

@@ -14,7 +14,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.rendering.path_io import load_path
 from vdgs.viewer import navigation
-from vdgs.viewer.path_panel import camera_at_time, path_json
+from vdgs.viewer.path_panel import camera_at_time, path_json, video_cameras
 
 
 def test_the_browsers_camera_is_ours():
@@ -68,7 +68,8 @@ def test_a_path_is_read_back_as_it_was_set(tmp_path):
         assert (first.fx, first.width, first.height) == (second.fx, second.width, second.height)
     content = json.loads(file.read_text())
     assert np.array_equal(content["keyframes"][1]["camera_from_world"], frames[1].camera_from_world)
-    assert np.allclose(camera_at_time(frames, 4.0, 0.0).camera_from_world, frames[0].camera_from_world)
-    assert np.allclose(camera_at_time(frames, 4.0, 99.0).camera_from_world, frames[-1].camera_from_world)
+    video = video_cameras(frames, 4.0)
+    for time, frame in ((0.0, frames[0]), (99.0, frames[-1])):
+        assert np.allclose(camera_at_time(video, time).camera_from_world, frame.camera_from_world)
     with pytest.raises(ValueError, match="at least one"):
         path_json([], 1.0)

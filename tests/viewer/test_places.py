@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import torch
 
 from support.captures import camera_at
+from support.hand_made_models import opaque_plane
 from support.viewer_scene import PLACE
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import look_at_pose
 from vdgs.viewer import navigation, overlays
+from vdgs.viewer.layers import DisplayOptions, Painter
 from vdgs.viewer.measure_panel import MeasurePanel
 from vdgs.viewer.measurement import MeasuredPoint, Ruler
 from vdgs.viewer.picking import measured_point, pick_point, pick_position, thumbnail
+from vdgs.viewer.point_panel import PointPanel
+from vdgs.viewer.viewer_scene import ViewerScene
 
 pytestmark = pytest.mark.xdist_group("viewer_scene")
 
@@ -47,6 +53,36 @@ def test_a_place_knows_who_sees_it_and_what_stands_between(scene):
     assert above.coordinates[0] == "east 0.30, north -0.20, up 1.50 m (ground frame)"
     latitude, longitude = (float(part.strip(" °")) for part in above.coordinates[1].split(",")[:2])
     assert (latitude, longitude) == pytest.approx(PLACE[:2], abs=1e-5)
+
+
+def test_what_has_faded_is_neither_met_nor_measured_nor_compared(scene):
+    """A shred above all cameras, which none of them sees: clicks, colors of depth and errors are of what is shown."""
+    whole, camera = scene.model("merged"), camera_at(0.0, 0.0, 8.0)
+    lifted = opaque_plane(half=0.8).anchors
+    lifted = replace(lifted, positions=lifted.positions + torch.tensor([0.0, 0.0, 5.0]))
+    tensors = {name: torch.cat([t, lifted.tensors()[name]]) for name, t in whole.anchors.tensors().items()}
+    model = replace(whole, anchors=type(whole.anchors)(**tensors))
+    shredded = ViewerScene(replace(scene.run, model=model), scene._open)
+    middle, session = (camera.width / 2, camera.height / 2), MagicMock()
+    session.scene, session.camera, session.pose = shredded, camera, navigation.CameraPose(camera.position, np.zeros(3))
+    session.submit.side_effect = lambda work: work()
+    panel = PointPanel(session)
+    panel.measure_panel, panel.clock = MagicMock(is_on=False), lambda: 0.0
+    for least, height in ((0, 5.0), (2, 1.5)):
+        session.display = DisplayOptions("depth", min_visibility=least)
+        measured = measured_point(shredded, "merged", camera, *middle, min_visibility=least)
+        assert measured is not None
+        assert measured.position[2] == pytest.approx(height, abs=0.05)
+        for _ in range(2):
+            panel.on_click((0.5, 0.5))
+        assert session.move_to.call_args.args[0].look_at[2] == pytest.approx(height, abs=0.05)
+        painter = Painter(shredded)
+        painter.update_depth_range(session.display, camera)
+        assert (painter.scale(session.display).low < 5.0) == (least == 0)
+        error = painter._comparison.error_map("merged", camera, camera, least)
+        assert np.isfinite(error[camera.height // 2, camera.width // 2]) == (least == 2)
+    point = np.array([0.0, 0.0, 1.5])
+    assert all(hit.unoccluded for hit in pick_point(shredded, "merged", point, min_visibility=2).hits)
 
 
 def test_a_thumbnail_marks_the_place(scene):

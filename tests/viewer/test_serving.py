@@ -6,11 +6,14 @@ import gc
 import io
 import json
 import math
+import os
 import shutil
 import socket
 import sys
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import MagicMock
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -26,6 +29,7 @@ from support.commands import PATIENCE_SECONDS, begun, vdgs, wait_until
 from support.next_commands import parse
 from support.small_pipeline import vdgs as here
 from support.viewer import Guest, expected, quiet, trained
+from vdgs.config.commands import ViewRequest
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import look_at_pose
@@ -33,7 +37,7 @@ from vdgs.rendering.path_io import load_path
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.stop_signals import STOP_SIGNALS
-from vdgs.viewer import navigation
+from vdgs.viewer import navigation, server
 from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.layers import Painter
 from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
@@ -394,6 +398,25 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
         if "**coarse** done" in guest.text():
             break
     assert "**coarse** done" in guest.text()
+
+
+def test_what_is_saved_while_a_run_is_opened_is_shown_too(run, tmp_path, monkeypatch):
+    """A merge is the last file to come: none after it would bring it."""
+    shutil.copytree(run, tmp_path / "run")
+    opened, viewer = open_run(tmp_path / "run"), MagicMock()
+
+    def open_slowly(*_):
+        os.utime(tmp_path / "run/coarse/model.safetensors", (1e9, 1e9))
+        return opened
+
+    monkeypatch.setattr(server, "open_run_or_checkpoint", open_slowly)
+    monkeypatch.setattr(server, "serve", lambda *_: nullcontext(viewer))
+    monkeypatch.setattr(server, "REFRESH_SECONDS", 0.0)
+    viewer.scene.run = opened
+    viewer.replace_run.side_effect = KeyboardInterrupt
+    viewer.set_progress.side_effect = [None, None, KeyboardInterrupt]
+    server.view_run(ViewRequest(run=tmp_path / "run"), Console(quiet=True))
+    viewer.replace_run.assert_called_once_with(opened)
 
 
 def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):

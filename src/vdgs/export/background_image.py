@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from vdgs.errors import VdgsError
 from vdgs.evaluation.metrics import to_8bit
@@ -39,4 +40,6 @@ def write_background(run: OpenedRun, path: Path) -> None:
     across, up = elevation.cos(), elevation.sin().expand(_ROWS, 2 * _ROWS)
     directions = torch.stack([across * azimuth.cos(), across * azimuth.sin(), up], dim=-1)
     picture = Image.fromarray(to_8bit(sample_envmap(envmap.detach().cpu(), directions).numpy()))
-    write_atomic(path, lambda temporary: picture.save(temporary, format="PNG"))
+    written_by = PngInfo()
+    written_by.add_text("Software", "vdgs")  # by which it may be overwritten
+    write_atomic(path, lambda temporary: picture.save(temporary, format="PNG", pnginfo=written_by))

@@ -7,8 +7,8 @@ Each step needs all of the one before. Shards are numbered through all steps, so
     compare, then mend  views, then parts   what pictures lack; what is added to colors. For each of the
                                             `color_iteration_cameras`
 
-    RUN/baking/shards/KEY/   of all shards together (`executors.sharded_job`): pixels.npy and kept.npy, from the survey;
-                             N.spool, the Gaussians after N rounds of fitting colors, the last of them alone
+    RUN/baking/shards/KEY/   of all shards together (`distributed.sharded_job`): pixels.npy and kept.npy, from the
+                             survey; N.spool, the Gaussians after N rounds of fitting colors, the last of them alone
 """
 
 from __future__ import annotations

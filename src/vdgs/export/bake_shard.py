@@ -1,4 +1,4 @@
-"""One shard of baking a scene, in a process of its own (`export.steps`)."""
+"""One shard of baking a scene, in a process of its own (`export.bake_plan`)."""
 
 from __future__ import annotations
 

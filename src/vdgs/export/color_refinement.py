@@ -29,6 +29,8 @@ from vdgs.kernels.kernel_types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import decode_view, rasterize_splats
 
+#: The largest weight of a view: the largest finite float16. Of a large photograph a Gaussian may make more.
+MOST_PIXELS = torch.finfo(torch.float16).max
 #: After so many views or parts the pages of the spool are let go.
 FLUSH_EVERY = 16
 
@@ -114,7 +116,7 @@ def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     pixels = found.pixels.index_select(0, shown)
     return ColorResidual(
         torch.from_numpy(numbers).index_select(0, shown).int(),
-        pixels.half(),
+        pixels.clamp(max=MOST_PIXELS).half(),
         (found.residual.index_select(0, shown) / pixels[:, None]).half(),
     )
 

@@ -161,23 +161,23 @@ def write_files(
     that a format or the capture does not have; and what `ShardedJob.send` raises.
     """
     print_warning(console, run.warning)
-    for path in request.output:
+    for path in _all_outputs(request):
         check_not_among_inputs(path, run.capture)
     if request.background is not None:
         check_background(run, request.background)
-        check_not_among_inputs(request.background, run.capture)
     center = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
-    for path in request.output:
+    for path in _all_outputs(request):
         check_takes_files(path.parent)
     _tidy(request.output, console)
     began = time.monotonic()
     whole, run = run, with_faded_edge(run, request)
+    page = make_initial_view(run, int(request.html_max_mb * 1e6))
     with _make_baker(run, request, execution, console) as baker, ExitStack() as stack:
         pixels = baker.pixels()
         kept = select_gaussians(pixels, run, request)
         means = gaussian_means(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
-        rows = select_rows(frames, means, pixels[kept], request, console)
+        rows = select_rows(frames, means, pixels[kept], request, page, console)
         console.print(
             f"{run.summary}: {len(kept):,} Gaussians of {len(pixels):,} are drawn by the training cameras"
             + (" and asked for" if len(kept) < np.count_nonzero(pixels) else ""),
@@ -196,9 +196,7 @@ def write_files(
             rows = {path: rows_within_reach(path, frame, shown.spool.means) for path, frame in frames.items()}
         _optimize(shown, baker.training, request.optimize_seconds, console)
         seconds = time.monotonic() - began
-        scene = _BakedScene(
-            shown.spool, request.sh_degree, make_initial_view(run, int(request.html_max_mb * 1e6)), request
-        )
+        scene = _BakedScene(shown.spool, request.sh_degree, page, request)
         files = [_write_fitting(path, frames[path], scene, rows[path], merging) for path in request.output]
         losses = _measure_losses(whole, frames, scene, request, console)
     if request.background is not None:
@@ -266,19 +264,37 @@ def _check_names(asked: ExportRequest) -> None:
     run, paths = asked.run, asked.output
     if not paths:
         raise VdgsError("Nothing to write: give --output FILE, such as --output scene.ply, or --for PROGRAM.")
-    for path in paths:
-        axes_for(path, asked)
+    for path in _all_outputs(asked):
         check_output(path)
         check_no_link(path)
+    if asked.background is not None:
+        registry.check_ours(asked.background)
+    for path in paths:
+        axes_for(path, asked)
         registry.check_not_foreign(path)
         if path.name.lower() == REPORT_FILE and os.path.realpath(path.parent) == os.path.realpath(run):
             raise VdgsError(
                 f"--output {path}: is the report of the run, which would be overwritten, and written again over the "
                 "page. Choose another name, such as scene.html."
             )
-    twice = sorted({str(path) for path in paths if paths.count(path) > 1})
-    if twice:
-        raise VdgsError(f"--output {twice[0]}: is given twice.")
+    _check_written_once(paths)
+
+
+def _all_outputs(asked: ExportRequest) -> list[Path]:
+    return [*asked.output, *([] if asked.background is None else [asked.background])]
+
+
+def _check_written_once(paths: Sequence[Path]) -> None:
+    """Raise VdgsError where one file, by whichever name, is written for two outputs."""
+    writers = dict[str, Path]()
+    for path in paths:
+        for file in registry.format_from_path(path).names(path):
+            other = writers.setdefault(os.path.realpath(file), path)
+            if other is path:
+                continue
+            if file.name == path.name == other.name:
+                raise VdgsError(f"--output {path}: is given twice.")
+            raise VdgsError(f"--output {path} and --output {other}: both write {file}. Choose another folder for one.")
 
 
 def _write(path: Path, scene: ExportScene, console: Console, notes: Sequence[str]) -> ExportedFile:

@@ -1,7 +1,7 @@
 """Baked Gaussians moved for some seconds towards the model's own pictures: colors, opacities and shapes, by Adam.
 
-What fits in closed form is done before (`baking`, `refit`); this takes longer, needs the whole scene in memory, three
-times (0.7 kB for each Gaussian of degree 3), and gains what is left.
+What fits in closed form is done before (`bake`, `color_refinement`); this takes longer, needs the whole scene in
+memory, three times (0.7 kB for each Gaussian of degree 3), and gains what is left.
 """
 
 from __future__ import annotations

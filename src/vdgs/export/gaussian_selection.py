@@ -13,7 +13,7 @@ from rich.console import Console
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
-from vdgs.export.formats.export_scene import ExportScene
+from vdgs.export.formats.export_scene import ExportScene, InitialView
 from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, default_crs, make_local_frame
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.decode_world import gaussian_means
@@ -89,7 +89,7 @@ def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, center: n
 
 def select_rows(
     frames: Mapping[Path, LocalFrame], means: Float[np.ndarray, "m 3"], pixels: Float[np.ndarray, " m"],
-    request: ExportRequest, console: Console,
+    request: ExportRequest, page: InitialView, console: Console,
 ) -> dict[Path, Int[np.ndarray, " r"]]:  # fmt: skip
     """Which of the Gaussians each file is given. What a format cannot hold is said before the work.
 
@@ -119,6 +119,7 @@ def select_rows(
                 degree=request.sh_degree,
                 metadata=frame.facts,
                 bounds=local_bounds(frame, means[rows[path]]),
+                page=page,
                 spz_version=request.spz_version,
             ),
         )

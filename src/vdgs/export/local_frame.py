@@ -45,7 +45,7 @@ class LocalFrame(Similarity):
         )
 
     def to_ground(self, gaussians: Gaussians) -> Gaussians:
-        """The inverse of `place`."""
+        """The inverse of `to_local`."""
         back = self.rotation.T
         return (
             gaussians
@@ -57,13 +57,13 @@ class LocalFrame(Similarity):
 def make_local_frame(
     ground: GroundFrame, crs: str | None, center: Float[np.ndarray, "3"], max_coordinate: float = MAX_LOCAL_COORDINATE
 ) -> LocalFrame:
-    """The local coordinates of a system (`Placement.of`) about a scene whose middle is `center` (ground frame).
+    """The local coordinates of a system (`MapProjection.of`) about a scene whose middle is `center` (ground frame).
 
     Gaussians take the similarity that is right about the center: over a kilometre a projection departs from it by
-    centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system
-    gets an origin of its own; in `enu` that is a place on Earth, about which x is east, y north and z up again, so that
-    what says of the file where it stands is one thing, its latitude, longitude and height. Raises VdgsError for a
-    system that cannot be had.
+    centimetres, mostly in height (the Earth is round). A middle that is more than `max_coordinate` from the origin of
+    the system gets an origin of its own; in `enu` that is a place on Earth, about which x is east, y north and z up
+    again, so that what says of the file where it stands is one thing, its latitude, longitude and height. Raises
+    VdgsError for a system that cannot be had.
     """
     placement = MapProjection.of(ground, crs)
     similarity = placement.similarity_at(center)

@@ -13,9 +13,9 @@
     }
 
 or a camera path exported by nerfstudio's viewer (`camera_path`, OpenGL cameras): in nerfstudio's own frame, which
-dataparser_transforms.json leads back from (`films.nerfstudio`), unless it has a `frame` too. `fov_deg` is the vertical
-angle of view. What a key frame leaves out of the intrinsics comes from the camera that the caller gives. What is not
-named here is a mistake. So it is in a file of nerfstudio's, where what its editor keeps for itself (`keyframes`,
+dataparser_transforms.json leads back from (`rendering.nerfstudio`), unless it has a `frame` too. `fov_deg` is the
+vertical angle of view. What a key frame leaves out of the intrinsics comes from the camera that the caller gives. What
+is not named here is a mistake. So it is in a file of nerfstudio's, where what its editor keeps for itself (`keyframes`,
 `smoothness_value`, ...) has its part in the frames already; what asks for another camera, a crop or another time is
 refused.
 """

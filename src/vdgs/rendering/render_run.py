@@ -259,6 +259,8 @@ def _named_cameras(request: RenderRequest, run_cameras: RunCameras) -> tuple[lis
     """The cameras with their names, and the frames per second for a video of them."""
     if request.path is None and request.views in ("test", "train"):
         views = run_cameras.test if request.views == "test" else run_cameras.train
+        if not views:
+            raise VdgsError(f"--views {request.views}: the run has no such views. Ask for others, such as orbit.")
         names = unique_file_stems([name for name, _ in views])
         return [(name, camera) for name, (_, camera) in zip(names, views, strict=True)], request.fps or STILLS_FPS
     cameras, ground = run_cameras.cameras, run_cameras.ground

@@ -82,7 +82,7 @@ def measure_capture(
     ground_height = float(np.median(points[:, 2]))
     heights = np.array([camera.position[2] for camera in cameras]) - ground_height
     sizes, counts = np.unique([(c.width, c.height) for c in cameras], axis=0, return_counts=True)
-    spacing = cKDTree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
+    spacing = _nearest_distances(points, capture.points)
     focal = float(np.median([camera.fx for camera in cameras]))
     fields = [2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) for camera in cameras]
     tilts = [np.degrees(np.arccos(np.clip(-camera.forward[2], -1, 1))) for camera in cameras]
@@ -121,6 +121,14 @@ def measure_capture(
         warnings=[*capture.warnings, *image_warnings, *validation.warnings, *_findings(visibility)],
         figures=[],
     )
+
+
+def _nearest_distances(some: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How far `some` of the points lie from the nearest other one of all: those of a sample lie farther apart."""
+    if len(points) < 2:
+        return np.zeros(1)
+    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)  # a fifth of the time; places are asked once
+    return np.asarray(tree.query(some, k=2)[0][:, 1])
 
 
 def _findings(visibility: np.ndarray) -> list[str]:

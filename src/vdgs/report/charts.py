@@ -50,9 +50,10 @@ def draw_curves(
     from_zero: bool = False,
     marked_iterations: Sequence[float] = (),
 ) -> EmbeddedImage | None:
-    """Curves over the iteration, with dotted lines at the iterations `marks`.
+    """Curves over the iteration, with dotted lines at `marked_iterations`.
 
-    `smooth` > 1 draws running medians over so many points, the points paler behind. None if there is no point to draw.
+    `smoothing_window` > 1 draws running medians over so many points, the points paler behind. None if there is no
+    point to draw.
     """
     curves = [curve for curve in curves if curve.has_data()]
     if not curves:

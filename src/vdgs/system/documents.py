@@ -37,7 +37,7 @@ class CaptureMetadata(TypedDict, total=False):
 
 class EvaluationMetrics(TypedDict, total=False):
     """metrics.json: means over the views; None where there is no such figure. The figures that are not named here have
-    the suffixes of `evaluation.view` (`_cc`, `_affine`, `_reference_exposure`)."""
+    the suffixes of `evaluation.view_metrics` (`_cc`, `_affine`, `_reference_exposure`)."""
 
     psnr: float | None
     ssim: float | None
@@ -162,7 +162,7 @@ class MapMetadata(TypedDict, total=False):
 
 
 class FitnessQuestion(TypedDict):
-    """What a node is asked to look at before it works on a run (`executors.fitness`)."""
+    """What a node is asked to look at before it works on a run (`distributed.node_check`)."""
 
     folder: str
     files: list[tuple[str, int]]

@@ -1,7 +1,8 @@
 """Folders and files that stand beside an output while it is written, and what killed processes leave of them.
 
 A scratch folder holds a locked file as long as its process lives, on whichever machine. Temporary files carry the
-number of their process (`write_atomically`).
+number of their process (`write_atomic`), which says nothing on another machine of the same disk: one that was written
+to of late stays.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from vdgs.system.atomic_files import explain_disk_errors
 
 #: How the names of scratch folders end, and their file that is locked.
 ENDING, LOCK = ".scratch", ".lock"
-#: Temporary files of `write_atomically` and of films.
+#: Temporary files of `write_atomic` and of films.
 _TEMPORARY = re.compile(r"(?:^|\.)([0-9]+)\.(?:tmp|partial\.mp4)$")
 #: A scratch folder without its file may just be made, for so many seconds.
 _YOUNG_SECONDS = 60.0
+#: A temporary file to which nothing came for so many seconds is not written to on another machine either (choice).
+QUIET_SECONDS = 600.0
 
 
 @contextmanager
@@ -64,7 +67,13 @@ def _is_left(entry: Path, rest: str) -> bool:
     if rest.endswith(ENDING) and entry.is_dir() and not entry.is_symlink():
         return not _is_held(entry)
     found = _TEMPORARY.search(rest)
-    return found is not None and entry.is_file() and not psutil.pid_exists(int(found[1]))
+    return found is not None and entry.is_file() and not psutil.pid_exists(int(found[1])) and _is_quiet(entry)
+
+
+def _is_quiet(file: Path) -> bool:
+    with suppress(OSError):  # gone: it took its place
+        return time.time() - file.stat().st_mtime > QUIET_SECONDS
+    return False
 
 
 def _is_held(folder: Path) -> bool:

@@ -39,7 +39,7 @@ class AccessControl:
         return self._url("localhost" if self.host in ALL_INTERFACES else self.host)
 
     def network_url(self) -> str | None:
-        """What to open on another machine, by the name of this one, where `address` does not do there; None where it
+        """What to open on another machine, by the name of this one, where `local_url` does not do there; None where it
         does, where no other machine can come in, and where this one has no name."""
         name = socket.gethostname()
         return (

@@ -56,30 +56,35 @@ class ImageComparison:
 
     def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
-        self._cache: OrderedDict[tuple[int, str, int], ImageErrorMap] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, str, int, int], ImageErrorMap] = OrderedDict()
 
-    def error_map(self, name: str, camera: Camera, full_camera: Camera) -> Float[np.ndarray, "h w"]:
+    def error_map(
+        self, name: str, camera: Camera, full_camera: Camera, min_visibility: int = 0
+    ) -> Float[np.ndarray, "h w"]:
         """The error against the photograph nearest to `full_camera`, as its part `camera` sees it; NaN where that
-        photograph does not show the point, or is masked."""
-        error_map = self._cached_error_map(name, nearest_view_index(self._scene, full_camera))
-        depth = render(self._scene.shown(name, full_camera), camera, depth=True).median_depth
+        photograph does not show the point, or is masked. The model fades out below so many training cameras."""
+        nearest = nearest_view_index(self._scene, full_camera)
+        error_map = self._cached_error_map(name, nearest, min_visibility)
+        shown = self._scene.shown(name, full_camera, min_visibility=min_visibility)
+        depth = render(shown, camera, depth=True).median_depth
         assert depth is not None
         return _reproject_error(error_map, camera, depth.cpu().numpy())
 
-    def _cached_error_map(self, name: str, index: int) -> ImageErrorMap:
-        key = (self._scene.generation, name, index)
+    def _cached_error_map(self, name: str, index: int, min_visibility: int) -> ImageErrorMap:
+        key = (self._scene.generation, name, index, min_visibility)
         if key not in self._cache:
-            self._cache[key] = self._compute_error_map(name, index)
+            self._cache[key] = self._compute_error_map(name, index, min_visibility)
             while len(self._cache) > _MAX_CACHED:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         return self._cache[key]
 
-    def _compute_error_map(self, name: str, index: int) -> ImageErrorMap:
+    def _compute_error_map(self, name: str, index: int, min_visibility: int) -> ImageErrorMap:
         view = self._scene.capture.views[index]
         camera = view.camera.limit_size(_MAX_COMPARE_PX)
         photograph = resize_area(self._scene.images.get(index), camera.width, camera.height)
-        shown, exposures = self._scene.shown(name, camera), self._scene.exposures(name)
+        shown = self._scene.shown(name, camera, min_visibility=min_visibility)
+        exposures = self._scene.exposures(name)
         if exposures is not None and isinstance(shown, AnchorModel):
             shown = shown.without_local_exposure()
         raster = render(shown, camera, depth=True)

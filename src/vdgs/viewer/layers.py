@@ -84,7 +84,8 @@ class Painter:
 
             capture = self._scene.capture
             small = full_camera.limit_size(_PREVIEW_PX)
-            shown = self._scene.shown(self._scene.shown_name(display.model), small)
+            name = self._scene.shown_name(display.model)
+            shown = self._scene.shown(name, small, min_visibility=display.min_visibility)
             depth = scalar_maps.render_depth(shown, small)
             depth_range = scalar_maps.depth_range([depth], camera_height(capture))
             self._depth = scalar_maps.depth_scale(depth_range, capture.ground.unit)
@@ -179,7 +180,7 @@ class Painter:
             )
         if display.layer == "alpha":
             return render(level.model, camera).alpha.cpu().numpy()
-        return self._comparison.error_map(name, camera, full_camera)
+        return self._comparison.error_map(name, camera, full_camera, display.min_visibility)
 
     def _side_by_side(
         self, display: DisplayOptions, camera: Camera, full_camera: Camera, draw: Callable[..., np.ndarray]

@@ -40,13 +40,13 @@ class LodPyramid:
     """A model and its thinner ones, each made when it is first needed."""
 
     def __init__(self, model: AnchorModel) -> None:
-        self._model = model
+        self.model = model
         self._levels = [LodLevel(model)]
 
     def of(self, camera: Camera, max_anchors: int | None = None) -> tuple[LodLevel, int]:
         """The model itself, or the finest level of which the camera sees at most so many anchors; and about how many
         of them it sees."""
-        model = self._model
+        model = self.model
         visible, number = len(cull_anchors(model.anchors, camera)), 0
         while max_anchors is not None and visible // decimation_factor(number) > max(max_anchors, 1):
             number += 1

@@ -67,13 +67,14 @@ class PathPanel:
             return
         self.stop()
         stopping = self._stopping = threading.Event()
-        frames, seconds, closed = list(self.keyframes), float(self._seconds.value), bool(self._closed.value)
+        seconds = float(self._seconds.value)
+        path = video_cameras(self.keyframes, seconds, bool(self._closed.value))
 
         def follow() -> None:
             began = time.monotonic()
             while not stopping.wait(1.0 / _PLAYBACK_FPS):
                 now = time.monotonic() - began
-                self._move_camera(camera_at_time(frames, seconds, now, closed))
+                self._move_camera(camera_at_time(path, now))
                 if now >= seconds:
                     return
 
@@ -112,7 +113,11 @@ def _keyframe_json(camera: Camera) -> dict[str, object]:
     }  # fmt: skip
 
 
-def camera_at_time(keyframes: Sequence[Camera], seconds: float, time: float, closed: bool = False) -> Camera:
-    """The camera of a path after so many seconds, as the video will have it."""
-    frames = interpolate(keyframes, max(1, round(seconds * DEFAULT_FPS)), closed)
-    return frames[min(max(int(time * DEFAULT_FPS), 0), len(frames) - 1)]
+def video_cameras(keyframes: Sequence[Camera], seconds: float, closed: bool = False) -> list[Camera]:
+    """The cameras of a path, as the video will have them."""
+    return interpolate(keyframes, max(1, round(seconds * DEFAULT_FPS)), closed)
+
+
+def camera_at_time(path: Sequence[Camera], time: float) -> Camera:
+    """The one of `video_cameras` after so many seconds."""
+    return path[min(max(int(time * DEFAULT_FPS), 0), len(path) - 1)]

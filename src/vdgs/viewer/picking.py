@@ -72,8 +72,11 @@ def pick_position(model: Drawable, camera: Camera, x: float, y: float) -> Float[
     return (local - translation) @ rotation
 
 
-def pick_point(scene: ViewerScene, name: str, position: Float[np.ndarray, "3"]) -> PickedPoint:
-    model, views = scene.shown(name), scene.capture.views
+def pick_point(
+    scene: ViewerScene, name: str, position: Float[np.ndarray, "3"], *, min_visibility: int = 0
+) -> PickedPoint:
+    """What is known of a point, where the model fades out below so many training cameras."""
+    model, views = scene.shown(name, min_visibility=min_visibility), scene.capture.views
     hits = [
         _image_hit(model, view.camera, index, view.name, position)
         for index, view in enumerate(views)
@@ -95,16 +98,19 @@ def _image_hit(model: Drawable, camera: Camera, index: int, name: str, position:
     return ImageHit(index, name, (x, y), float(depth[0]) / camera.fx, unoccluded, error)
 
 
-def measured_point(scene: ViewerScene, name: str, camera: Camera, x: float, y: float) -> MeasuredPoint | None:
+def measured_point(
+    scene: ViewerScene, name: str, camera: Camera, x: float, y: float, *, min_visibility: int = 0
+) -> MeasuredPoint | None:
     """The point that the pixel at `x`, `y` shows, for the ruler; None where nothing is drawn.
 
     It is off across the view by half a pixel of the clicked picture, or of the photograph that shows it best where that
     is coarser, and along it by what the depths disagree that the nearest photographs see.
     """
-    position = pick_position(scene.shown(name), camera, x, y)
+    position = pick_position(scene.shown(name, min_visibility=min_visibility), camera, x, y)
     if position is None:
         return None
-    hits = [hit for hit in pick_point(scene, name, position).hits if hit.unoccluded][:_MARKED_IMAGES]
+    point = pick_point(scene, name, position, min_visibility=min_visibility)
+    hits = [hit for hit in point.hits if hit.unoccluded][:_MARKED_IMAGES]
     pixel = float(np.linalg.norm(position - camera.position)) / camera.fx
     across = 0.5 * max([pixel, *(hit.ground_sampling for hit in hits[:1])])
     along = float(np.median([abs(hit.depth_error) for hit in hits])) if hits else 0.0

@@ -45,23 +45,26 @@ class PointPanel:
         if camera is None:
             return
         is_double = self._is_double(screen)
-        name = session.scene.shown_name(session.display.model)
+        scene, display = session.scene, session.display
+        name, least = scene.shown_name(display.model), display.min_visibility
         x, y = screen[0] * camera.width, screen[1] * camera.height
         if self.measure_panel.is_on:
-            measured = session.submit(lambda: measured_point(session.scene, name, camera, x, y))
+            measured = session.submit(lambda: measured_point(scene, name, camera, x, y, min_visibility=least))
             if measured is not None:
                 self.measure_panel.add(measured)
             else:
                 self._label.content = _NOTHING
             return
-        position = session.submit(lambda: pick_position(session.scene.model(name), camera, x, y))
+        position = session.submit(lambda: pick_position(scene.shown(name, min_visibility=least), camera, x, y))
         if position is None:
             self._label.content = _NOTHING
         elif is_double:
             session.move_to(navigation.CameraPose(session.pose.position, position))
-        elif (point := session.submit(lambda: pick_point(session.scene, name, position))) is not None:
-            with self._showing:
-                self._show_point(point)
+        else:
+            point = session.submit(lambda: pick_point(scene, name, position, min_visibility=least))
+            if point is not None:
+                with self._showing:
+                    self._show_point(point)
 
     def _is_double(self, screen: tuple[float, float]) -> bool:
         """Whether this click is the second of two; a third one begins anew."""

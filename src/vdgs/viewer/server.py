@@ -49,13 +49,14 @@ REFRESH_SECONDS = 2.0
 
 
 def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], None] | None = None) -> None:
-    """Serve a run until Ctrl-C. `opened` is called with the address once it can be opened.
+    """Serve a run until Ctrl-C. `on_ready` is called with the address once it can be opened.
 
     Raises VdgsError for a run without a model, an address that cannot be used, and where viser is not installed.
     """
     _require_viser()
     limit_malloc_arenas()
     find_free_port(request.host, request.port)  # said before the run is opened
+    seen = run_file_times(RunFolder(request.run))  # before: what is written meanwhile is newer
     run = open_run_or_checkpoint(request.run, request.model, request.device)
     print_warning(console, run.warning)
     if not is_of_present_version(run.folder):
@@ -72,7 +73,7 @@ def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], N
             console.print(line, highlight=False, soft_wrap=True)
         if on_ready is not None:
             on_ready(viewer.access.local_url())
-        _serve_until_stopped(viewer, request, console)
+        _serve_until_stopped(viewer, request, seen, console)
 
 
 def startup_message(scene: str, access: AccessControl) -> list[str]:
@@ -169,10 +170,12 @@ def _set_initial_camera(server: Any, run: OpenedRun) -> None:
     start.near, start.far = 1e-3 * height, 1000 * height
 
 
-def _serve_until_stopped(viewer: ViewerServer, request: ViewRequest, console: Console) -> None:
-    """Serve, and follow a run that is not finished."""
+def _serve_until_stopped(
+    viewer: ViewerServer, request: ViewRequest, seen: tuple[tuple[str, int], ...], console: Console
+) -> None:
+    """Serve, and follow a run that is not finished and had the files `seen` (`run_file_times`) when it was opened."""
     folder = RunFolder(request.run)
-    seen, follows = run_file_times(folder), viewer.scene.run.name != "merged" and request.model == "best"
+    follows = viewer.scene.run.name != "merged" and request.model == "best"
     looked = 0.0
     while True:
         check_stop_requested()

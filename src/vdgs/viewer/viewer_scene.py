@@ -99,12 +99,13 @@ class ViewerScene:
             self._trees[name] = find_tree(self.get_run(name))
         return self._trees[name]
 
-    def shown(self, name: str, view: Camera | None = None) -> Drawable:
+    def shown(self, name: str, view: Camera | None = None, *, min_visibility: int = 0) -> Drawable:
         """What single pixels are drawn from: the tree at its finest but for the anchors far away; and what all of a
-        view is compared by: as finely as at rest."""
-        tree = self.tree(name)
+        view is compared by: as finely as at rest. Faded out as pictures are (`get_level`): what cannot be seen there
+        is not to be met."""
+        tree = self._faded_tree(name, min_visibility)
         if tree is None:
-            return self.model(name)
+            return self._pyramid(name, min_visibility).model
         finest = tree.at_error(REST_ERROR_PX)
         return finest if view is None else finest.within(view, REST_MAX_COST)
 

@@ -89,13 +89,14 @@ def read(file: Path, options: CaptureOptions) -> Project:
             "there (a name in each line, in the order of the cameras)."
         )
     called = [names[camera.number] for camera in model.cameras]
-    lost = [name for number, name in enumerate(names) if number not in {each.number for each in model.cameras}]
+    placed = {camera.number for camera in model.cameras}
+    lost = [name for number, name in enumerate(names) if number not in placed]
     root = file.parent.parent if file.parent.name == "bundle" else file.parent
     views = []
     order = np.argsort(model.seen_camera, kind="stable")
+    starts = np.searchsorted(model.seen_camera[order], np.arange(model.num_cameras + 1))
     for camera, name, size in zip(model.cameras, called, photograph_sizes(root, options, called, file), strict=True):
-        first, last = np.searchsorted(model.seen_camera[order], [camera.number, camera.number + 1])
-        mine = order[first:last]
+        mine = order[starts[camera.number] : starts[camera.number + 1]]
         shown = model.seen_point[mine], model.seen_px[mine] + np.array(size) / 2
         check_seen_inside(shown[1], size, file, name)
         lens, pose = camera.intrinsics(size, file), camera.camera_from_world

@@ -250,7 +250,8 @@ def _system(items: _Items) -> tuple[ToGeodetic | None, str, bool]:
 
     def to_earth(points: np.ndarray) -> np.ndarray:
         base = (points - shift)[:, order] / scale
-        # The system is told with its own axes; what is asked has x to the east.
-        return known(base[:, order]) + np.array([0.0, 0.0, geoid])
+        # The system is told with its own axes; what is asked has x to the east. The geoid's height above the ellipsoid
+        # has the unit of the system's heights.
+        return known(base[:, order] + np.array([0.0, 0.0, geoid]))
 
     return to_earth, f"OPF, {name}", False

@@ -97,8 +97,9 @@ def _center(camera_from_world: np.ndarray) -> np.ndarray:
 
 def _match(theirs: list[str], ours: list[str], aliases: Mapping[str, str]) -> list[tuple[str, str]]:
     """Pairs of names that mean the same photograph: by alias, by full name, else by unique stem."""
+    known = set(ours)
     exact = [(aliases.get(name, name), name) for name in theirs]
-    pairs = [(name, alias) for alias, name in exact if alias in set(ours)]
+    pairs = [(name, alias) for alias, name in exact if alias in known]
     if len(pairs) >= 3:
         return pairs
     stems: dict[str, list[str]] = {}

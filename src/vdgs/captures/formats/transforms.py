@@ -7,7 +7,6 @@ world is the original one, so that georeferences hold.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -88,7 +87,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     photographs = _find_photographs([_file_path(frame, file) for frame in frames], file, root, options)
     names, chosen, notes = photographs.names, photographs.folder, photographs.notes
     splits = _splits(content, names, names[count:], file, options, notes)
-    undo = _undo_applied(content, file)
+    applied = _parse_applied(content, file)
     views, poses, missing, lost = list[SourceView](), dict[str, np.ndarray](), list[str](), list[str]()
     bad = dict[str, CaptureError]()
     for frame, name, short, image in zip(frames, names, photographs.shorts, photographs.images, strict=True):
@@ -103,7 +102,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
         except BadPose as error:
             bad[short] = error
             continue
-        pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
+        pose, poses[short] = np.linalg.inv(applied.undo_pose(in_file)), np.linalg.inv(in_file)
         intrinsics = parse_intrinsics(frame, content, image, file)
         views.append(
             SourceView(
@@ -122,14 +121,11 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
     points, colors = _points(root, content, file, poses, options.images, needs_points, warnings)
-    homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
-    homogeneous[:, :3, 3] = points
-    moved = undo(homogeneous)[:, :3, 3]
     return SourceCapture(
         source="transforms",
         images=chosen,
         views=tuple(views),
-        points=moved,
+        points=applied.undo_places(points),
         colors=colors,
         image_folders=(root / chosen,) if chosen else (),
         warnings=tuple(warnings),
@@ -224,8 +220,25 @@ def _splits(
     return splits
 
 
-def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.ndarray]:
-    """A function that takes rigid world-from-camera matrices [..., 4, 4] back to the original world."""
+class _Applied(NamedTuple):
+    """What was done to the original world: a motion, then a scale."""
+
+    original_from_world: np.ndarray
+    scale: float
+
+    def undo_pose(self, world_from_camera: np.ndarray) -> np.ndarray:
+        """A rigid world-from-camera matrix [4, 4] in the original world."""
+        unscaled = world_from_camera.copy()
+        unscaled[:3, 3] /= self.scale
+        return self.original_from_world @ unscaled
+
+    def undo_places(self, places: np.ndarray) -> np.ndarray:
+        """Places [n, 3] in the original world."""
+        turn, shift = self.original_from_world[:3, :3], self.original_from_world[:3, 3]
+        return places / self.scale @ turn.T + shift
+
+
+def _parse_applied(content: JsonObject, file: Path) -> _Applied:
     applied = np.eye(4)
     if content.get("applied_transform") is not None:
         applied = to_rigid(
@@ -234,14 +247,7 @@ def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.
     scale = parse_number(content, "applied_scale", file) or 1.0
     if not 1e-9 < scale < 1e9:
         raise CaptureError(f"{file}: applied_scale {scale} must be a positive factor.")
-    original_from_world = np.linalg.inv(applied)
-
-    def undo(world_from_camera: np.ndarray) -> np.ndarray:
-        unscaled = world_from_camera.copy()
-        unscaled[..., :3, 3] /= scale
-        return original_from_world @ unscaled
-
-    return undo
+    return _Applied(np.linalg.inv(applied), scale)
 
 
 def _points(

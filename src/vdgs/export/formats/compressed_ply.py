@@ -61,7 +61,7 @@ def write_compressed_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
             order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(held.means)).numpy()
             with temporary.open("wb") as file:
                 file.write(header)
-                for first in range(0, count, CHUNK_SIZE):  # whole chunks: ROWS is a multiple of them
+                for first in range(0, count, CHUNK_SIZE):  # whole chunks: CHUNK_SIZE is a multiple of CHUNK
                     piece = held.rows(order[first : first + CHUNK_SIZE])
                     bounds, packed = _packed(piece)
                     _put(file, len(header) + first // CHUNK * 4 * len(BOUNDS), bounds)

@@ -82,12 +82,14 @@ _CAPTION = (
 )
 
 
-def check_viser(path: Path, scene: ExportScene) -> None:
-    """Raise VdgsError where the package that holds the client is missing."""
+def check_page(path: Path, scene: ExportScene) -> None:
+    """Raise VdgsError where the package that holds the client is missing, or the client has no room in the page."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise VdgsError(f"{path}: pages need viser. Install it: pip install 'vdgs[viewer]'") from error
+    if scene.page is not None and scene.page.max_bytes <= (frame := _frame_bytes()):
+        raise _no_room(scene.page, frame)
 
 
 def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
@@ -139,16 +141,25 @@ def html_capacity(gaussians: Gaussians, page: InitialView) -> int:
     """How many like these a page has room for, by a sample of them. Raises VdgsError for next to none."""
     sampled = min(SAMPLE_GAUSSIANS, len(gaussians))
     some = gaussians.select(torch.linspace(0, len(gaussians) - 1, sampled, dtype=torch.float32).long())
-    frame = len(_client_html()) + 4096
+    frame = _frame_bytes()
     factor = length_factor(some)
     each = SIZE_MARGIN * len(_recording(packed_rows(some, factor), factor, page)) / len(some)
     count = int((page.max_bytes - frame) / each)
     if count < min(MIN_GAUSSIANS, len(gaussians)):
-        raise VdgsError(
-            f"A page of {page.max_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
-            f"{frame / 1e6:.1f} MB. Allow more: --html-max-mb."
-        )
+        raise _no_room(page, frame)
     return count
+
+
+def _frame_bytes() -> int:
+    """What a page takes beside the Gaussians."""
+    return len(_client_html()) + 4096
+
+
+def _no_room(page: InitialView, frame: int) -> VdgsError:
+    return VdgsError(
+        f"A page of {page.max_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
+        f"{frame / 1e6:.1f} MB. Allow more: --html-max-mb."
+    )
 
 
 def length_factor(gaussians: Gaussians) -> float:

@@ -13,13 +13,13 @@ from vdgs.export.formats.export_scene import ExportScene, InitialView, concatena
 from vdgs.export.formats.file_folders import FileFolder
 from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
-from vdgs.export.formats.html import check_viser, html_capacity, read_html_chunks, write_html
+from vdgs.export.formats.html import check_page, html_capacity, read_html_chunks, write_html
 from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
 from vdgs.export.formats.rad import write_rad
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
 from vdgs.export.formats.spz import MAX_COORDINATE, check_range, read_spz_chunks, write_spz
-from vdgs.export.formats.streamed_page import NODE_FOLDER, SCENE_FILE, check_page_folder, write_streamed_page
+from vdgs.export.formats.streamed_page import NODE_FOLDER, PAGE_FILE, SCENE_FILE, check_page_folder, write_streamed_page
 from vdgs.export.formats.streamed_sog import LOD_FILE, LOD_FOLDER, check_lod_folder, write_streamed_sog
 from vdgs.export.formats.tiles_3d import TILE_FOLDER, TILESET_FILE, check_tileset_folder, write_tiles
 from vdgs.model.gaussians import Gaussians
@@ -54,6 +54,12 @@ class ExportFormat:
     capacity: Callable[[Gaussians, InitialView], int] | None = None
     #: Where other files lie that the file names.
     folder: FileFolder | None = None
+    #: What is written beside the file under a name of its own.
+    page_file: str | None = None
+
+    def names(self, path: Path) -> list[Path]:
+        """The files that are written under names which another output could have too."""
+        return [path, *([path.with_name(self.page_file)] if self.page_file else [])]
 
     def files(self, path: Path) -> list[Path]:
         """A file that was written, with those that it names."""
@@ -126,13 +132,14 @@ FORMATS: tuple[ExportFormat, ...] = (
         check=check_page_folder,
         fixed_colors=True,
         folder=NODE_FOLDER,
+        page_file=PAGE_FILE,
     ),
     ExportFormat(
         suffix=".html",
         description="page that shows the scene offline",
         write=write_html,
         read=read_html_chunks,
-        check=check_viser,
+        check=check_page,
         fixed_colors=True,
         capacity=html_capacity,
     ),
@@ -160,7 +167,11 @@ def format_from_path(path: Path) -> ExportFormat:
 
 def check_not_foreign(path: Path) -> None:
     """Raise VdgsError where a file stands at the path that says nowhere, nor its FILE.json, that vdgs wrote it."""
-    beside = [metadata_path(path)] if format_from_path(path).writes_metadata_file else []
+    check_ours(path, *([metadata_path(path)] if format_from_path(path).writes_metadata_file else []))
+
+
+def check_ours(path: Path, *beside: Path) -> None:
+    """Raise VdgsError where a file stands at the path that says nowhere, nor those beside it, that vdgs wrote it."""
     try:
         if not path.is_file() or not path.stat().st_size or any(map(_names_vdgs, (path, *beside))):
             return

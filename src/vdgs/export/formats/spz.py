@@ -244,7 +244,12 @@ def decode_spz(data: bytes, path: Path) -> Iterator[Gaussians]:
     ):
         raise VdgsError(f"{path}: is no SPZ of versions 2 to 4.")
     _, version, n, degree, fraction, _, _ = fields
-    rest = num_sh_bases(degree) - 1 if degree <= MAX_SH_DEGREE else 0
+    if degree > MAX_SH_DEGREE:
+        raise VdgsError(
+            f"{path}: has spherical harmonics of degree {degree}, and vdgs reads those up to {MAX_SH_DEGREE}. Write it "
+            "with fewer."
+        )
+    rest = num_sh_bases(degree) - 1
     widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest)
     if len(data) != HEADER_STRUCT.size + n * sum(widths):
         raise VdgsError(f"{path}: is shorter or longer than its {n} Gaussians. It is damaged; write it again.")

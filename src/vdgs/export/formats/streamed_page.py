@@ -1,8 +1,8 @@
 """`FOLDER/scene.json`: a folder that any web server serves, with a page that loads what is near finely.
 
 `index.html` is the page, without anything from elsewhere; `scene.json` holds the view and a quadtree
-(`lod_quadtree`), whose nodes lie in a folder beside it as the page's texture holds them: 32 bytes for each Gaussian, as
-in `.html`, with V in the number that is free there. Colors do not change with the direction.
+(`tile_quadtree`), whose nodes lie in a folder beside it as the page's texture holds them: 32 bytes for each Gaussian,
+as in `.html`, with V in the number that is free there. Colors do not change with the direction.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """3D Tiles 1.1: the scene as a tree of small tiles by place, coarse ones from afar and fine ones near by.
 
-`FOLDER/tileset.json` names the tiles of a quadtree (`lod_quadtree`) in a folder beside it. A tile is a GLB around an
+`FOLDER/tileset.json` names the tiles of a quadtree (`tile_quadtree`) in a folder beside it. A tile is a GLB around an
 SPZ, the only kind that CesiumJS draws so far. Tiles stand in local coordinates with z up, each about its own middle;
 the root's transform takes them to Earth-centered coordinates where the scene is georeferenced.
 """

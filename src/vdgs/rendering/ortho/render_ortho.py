@@ -77,7 +77,7 @@ def _render_sharded(
 ) -> tuple[float, Path]:
     """Let shards of the tiles be drawn elsewhere, and gather them one at a time. This process holds no model."""
     context.release_models()
-    run = RunFolder(Path(os.path.abspath(request.run)))  # as in `stages.train`: other machines may mount it so
+    run = RunFolder(Path(os.path.abspath(request.run)))  # as in `pipeline.train_blocks`: other machines may mount it so
     model = locate_model(run, request.model)
     model_id = model.stage.status().model_id
     plan = OrthoPlan.of(request, run.path, model.name, model_id, context.capture, model.warning)
