@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from contextlib import contextmanager
@@ -30,7 +29,6 @@ from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
 from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save_run_cameras
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_keys import hashable_settings
 from vdgs.runs.visibility_store import get_run_visibility
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
@@ -121,18 +119,6 @@ def test_files_in_a_capture_that_moved_moved_with_it(listed, redo):
 def test_a_command_that_names_the_capture_alone_finds_its_files(listed):
     given = {"output": listed / "run", "capture": listed / "moved"}
     assert start_settings(given).options.test_list == listed / "moved" / "mine.txt"
-
-
-def test_a_run_of_an_older_version_knows_its_model_while_the_capture_lies_there(listed):
-    run = RunFolder(listed / "run")
-    own = {name: run.settings().to_dict()[name] for name in ("capture", "training")}
-    own = {name: hashable_settings(name, values) for name, values in own.items()}
-    old = hashlib.sha256(json.dumps([own], sort_keys=True).encode()).hexdigest()[:16]
-    new = run.keys().coarse
-    (run.coarse.path / "key").write_text(old)
-    assert new != old == run.keys().coarse
-    with pytest.raises(RunError, match=f"Put the capture back to {listed}/place"):
-        relocate_capture(run, listed / "moved")
 
 
 def test_what_needs_the_capture_says_how_to_name_it(folder):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -12,12 +10,9 @@ import pytest
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import CompensationConfig, DensifyConfig, MethodConfig, PartitionConfig
 from vdgs.config.presets import PRESETS
-from vdgs.config.serialization import to_dict
 from vdgs.partition.partition_scene import choose_block_count
-from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_keys import stage_keys
-from vdgs.system.atomic_files import write_json
 
 PLAIN = MethodConfig()
 CHANGED = {
@@ -83,17 +78,3 @@ def test_a_scene_is_cut_anew_where_an_automatic_number_of_blocks_is_another(bloc
 
 def test_what_does_not_change_an_automatic_number_of_blocks_leaves_the_cut():
     assert keys(automatic()).partition == keys(automatic(iterations=7, decoder="own")).partition
-
-
-def test_a_cut_of_a_version_whose_key_does_not_tell_its_number_of_blocks_stands_until_that_changes(tmp_path):
-    run = RunFolder(tmp_path)
-    run.create_or_check(RunSettings.create("/somewhere", CaptureOptions(), automatic()))
-    new = run.keys()
-    coarse_only = json.dumps([{"partition": to_dict(run.settings().partition)}, new.visibility], sort_keys=True)
-    old = hashlib.sha256(coarse_only.encode()).hexdigest()[:16]
-    write_json(run.partition_file, {"key": old})
-    assert run.keys().partition == old != new.partition
-    run.change_settings(replace(run.settings(), block=replace(run.settings().block, iterations=7)), overwrite=True)
-    assert run.keys().partition == old
-    run.change_settings(replace(run.settings(), block=automatic(swa_fraction=0.0).block), overwrite=True)
-    assert run.keys().partition not in (old, new.partition)

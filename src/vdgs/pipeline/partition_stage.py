@@ -143,7 +143,7 @@ def partition_run(
             ),
             seconds=time.monotonic() - start, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
-        write_json(run.partition_file, record_to_dict(record))  # last: the rest is complete
+        write_json(run.partition / "partition.json", record_to_dict(record))  # last: the rest is complete
         if is_distributed:
             remove(job.folder)
     console.print(make_assignment_table(rows))

@@ -15,7 +15,7 @@ from vdgs.partition.block_records import PartitionRecord
 from vdgs.runs.config_file import ConfigFile, changed_flags
 from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.stage_keys import StageKeys, block_count_settings, stage_keys
+from vdgs.runs.stage_keys import StageKeys, stage_keys
 from vdgs.system.atomic_files import read_json, read_json_or_empty
 from vdgs.system.file_locks import is_known_locked, lock_folder
 from vdgs.system.quoting import shell_line, shell_word
@@ -83,13 +83,9 @@ class RunFolder:
     def partition(self) -> Path:
         return self.path / "partition"
 
-    @property
-    def partition_file(self) -> Path:
-        return self.partition / "partition.json"
-
     def partition_record(self) -> PartitionRecord:
         """The content of partition.json; empty if the scene is not partitioned yet. RunError for a damaged file."""
-        file = self.partition_file
+        file = self.partition / "partition.json"
         try:
             return record_from_dict(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
         except (VdgsError, ValueError) as error:
@@ -163,8 +159,6 @@ class RunFolder:
                 + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old "
                 "settings to continue, or begin another run: vdgs run CAPTURE --output RUN"
             )
-        if self.keys().partition == after.partition and block_count_settings(old) != block_count_settings(settings):
-            self.partition_file.unlink(missing_ok=True)  # an older version's, whose key does not tell
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
             self.coarse.reset_unless(after.coarse)
@@ -184,21 +178,15 @@ class RunFolder:
 
     def move_capture(self, to: Path) -> None:
         """Save that the capture of the run lies elsewhere now, with the files in it that options name; the caller
-        checks that it is the same one. RunError where the run of an older version would not know its model again."""
+        checks that it is the same one."""
         settings, command = self.settings(), self.config.command()
         before, now = settings.capture_path, str(to.resolve())
         if before == now:
             return
-        moved_settings = settings.moved(to.resolve())
-        if self.coarse.is_done(self.keys().coarse) and not self.coarse.is_done(self.keys(moved_settings).coarse):
-            raise RunError(
-                f"{self.config_file}: was written by an older version, for a capture whose files options name by where "
-                f"they lay. Put the capture back to {before}, or begin another run: vdgs run CAPTURE --output RUN"
-            )
         words = shlex.split(command) if command else []
         named = [now + word[len(before) :] if f"{word}/".startswith(f"{before}/") else word for word in words]
         moved = shell_line(named) if before in words else None
-        self.config.write(moved_settings, moved)
+        self.config.write(settings.moved(to.resolve()), moved)
 
     def settings(self) -> RunSettings:
         """The settings of the run (`ConfigFile.settings`)."""
@@ -211,9 +199,7 @@ class RunFolder:
     def keys(self, settings: RunSettings | None = None) -> StageKeys:
         """The key of every stage, for these settings or those that config.yaml holds, and for the coarse model and the
         record of what moves that are there."""
-        made = {"coarse": self.coarse.key(), "partition": read_json_or_empty(self.partition_file).get("key")}
-        motion = read_json_or_empty(self.motion_file)
-        return stage_keys(settings or self.settings(), self.coarse_model_id(), motion, made)
+        return stage_keys(settings or self.settings(), self.coarse_model_id(), read_json_or_empty(self.motion_file))
 
     @property
     def motion_file(self) -> Path:

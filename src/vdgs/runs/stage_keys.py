@@ -44,38 +44,27 @@ def stage_keys(
     settings: RunSettings,
     coarse_model: str | None = None,
     motion: Mapping[str, Any] | None = None,
-    made: Mapping[str, str | None] | None = None,
 ) -> StageKeys:
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
     (`coarse_model`): trained again on another machine it may differ in its last bits. `motion` is the record of what
-    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not. `made` are the
-    keys of the coarse model and of the cut that are there: those of older versions stand, which held absolute paths of
-    files in the capture, and did not tell what an automatic number of blocks followed from."""
-    keys, made = dict[str, str](), made or {}
-    plain, placed = settings.moved(Path()).to_dict(), settings.to_dict()
+    moves (`runs.motion_masks`), which says whether the blocks leave it out where the settings do not."""
+    # Where the capture lies is not what it is: a capture that moved keeps its results.
+    keys, plain = dict[str, str](), settings.moved(Path()).to_dict()
     for stage, (sections, before) in STAGE_DEPENDENCIES.items():
-        # Where the capture lies is not what it is: a capture that moved keeps its results.
         own: dict[str, Any] = {name: hashable_settings(name, plain[name]) for name in sections}
         if stage == "blocks":  # what is asked counts by what it does
             del own["block"]["mask_moving"]
             own |= {"masks": "auto"} if leaves_out_motion(settings, keys["visibility"], motion or {}) else {}
         if stage == "merge" and not settings.training.exposure_compensation:
             del own["merge"]["reference_exposure"]  # there is none, and runs of before stay as they are
+        if stage == "partition" and settings.partition.blocks == "auto":
+            own["block_count"] = _block_count_settings(settings)
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
-        keys[stage] = _digest(content)
-        if stage == "coarse":
-            older = _digest([own | {"capture": hashable_settings("capture", placed["capture"])}])
-            keys[stage] = older if made.get(stage) == older else keys[stage]
-        if stage == "partition" and settings.partition.blocks == "auto" and made.get(stage) != keys[stage]:
-            keys[stage] = _digest([*content, block_count_settings(settings)])
+        keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)
 
 
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def block_count_settings(settings: RunSettings) -> dict[str, Any]:
+def _block_count_settings(settings: RunSettings) -> dict[str, Any]:
     """What the number of blocks follows from with `--blocks auto`, of the settings of blocks: what makes their training
     take more memory (`memory_estimate.block_workload`)."""
     block, compensation = settings.block, settings.block.compensation
@@ -96,9 +85,8 @@ def leaves_out_motion(settings: RunSettings, visibility_key: str, motion: Mappin
 
 
 def moves_enough(motion: Mapping[str, Any]) -> bool:
-    """Whether `auto` masks what moves by this record, which `on` may have asked for. (Older versions recorded only
-    whether there are masks.)"""
-    return bool(motion.get("enough", motion.get("masked")))
+    """Whether `auto` masks what moves by this record, which `on` may have asked for."""
+    return bool(motion.get("enough"))
 
 
 def hashable_settings(section: str, settings: dict[str, Any]) -> dict[str, Any]:
