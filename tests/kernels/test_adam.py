@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -205,6 +206,22 @@ def test_zero_gradients_of_fresh_rows_change_nothing(implementation):
     before, zeros = parameter.clone(), torch.zeros(5, 3)
     assert adam_rows(implementation, parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1)
     assert torch.equal(parameter, before)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@every_instruction_set
+def test_moments_of_what_no_view_shows_any_more_end_at_zero(instructions, threads):
+    """Steps of numbers nearer to 0 than the least normal one take a processor ten times as long, and 0.9 times the
+    least few of them rounds up again. Outside the kernels such numbers stay what they are."""
+    least = torch.finfo(torch.float32).smallest_normal
+    parameter, gradient = torch.ones(40_000, 2), torch.zeros(40_000, 2)
+    first, second = torch.full_like(parameter, 3 * least), torch.full_like(parameter, 1e-8)
+    with using(instructions), on_threads(threads):
+        for step in range(1000, 1020):
+            adam_rows(native, parameter, None, gradient, first, second, learning_rate=0.01, step=step)
+    assert not first.any()
+    assert (parameter == 1).all()
+    assert float(np.float32(least) / np.float32(2)) > 0
 
 
 @BOTH

@@ -20,7 +20,8 @@ void run(int64_t n_tasks, Task task, const void* body);
 }  // namespace detail
 
 // Calls body(0) .. body(n_tasks - 1), each once, in any order on any thread; whoever is free takes the
-// next. Returns when all are done. The first exception stops the rest and reaches the caller.
+// next. Returns when all are done. The first exception stops the rest and reaches the caller. In the
+// body, numbers nearer to 0 than 1.2e-38 count as 0.
 template <class Body>
 void parallel_for(int64_t n_tasks, const Body& body) {
   detail::run(n_tasks, [](const void* b, int64_t index) { (*static_cast<const Body*>(b))(index); }, &body);

@@ -14,11 +14,14 @@ struct Half {
 };
 
 VDGS_INLINE F16 from_half(I16 bits) {
-  const I16 magnitude = shift_left<13>(bits & splat(0x7fff)), sign = shift_left<16>(bits & splat(0x8000));
-  // 2^112 is what the exponents of both formats begin apart; the largest one stands for infinity and NaN.
-  const F16 finite = float_of_bits(magnitude) * splat(5192296858534827628530496329220096.0f);
-  const F16 beyond = float_of_bits(magnitude | splat(0x7f800000));
-  const F16 value = select(lt(magnitude, splat(0x7c00 << 13)), finite, beyond);
+  const I16 magnitude = bits & splat(0x7fff), sign = shift_left<16>(bits & splat(0x8000));
+  const I16 shifted = shift_left<13>(magnitude);
+  // 112 is what the exponents of both formats begin apart; the largest one stands for infinity and NaN, the
+  // least for multiples of 2^-24.
+  const F16 small = to_float(magnitude) * splat(5.9604644775390625e-8f);
+  const F16 finite = select(lt(magnitude, splat(0x0400)), small, float_of_bits(shifted + splat(112 << 23)));
+  const F16 beyond = float_of_bits(shifted | splat(0x7f800000));
+  const F16 value = select(lt(magnitude, splat(0x7c00)), finite, beyond);
   return float_of_bits(bits_of(value) | sign);
 }
 
