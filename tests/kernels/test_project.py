@@ -160,6 +160,15 @@ def test_the_constants_of_the_kernels_are_those_of_the_twins(isa):
         assert value == pytest.approx(getattr(constants, name), rel=1e-6), name
 
 
+def test_second_derivatives_are_refused_where_there_are_none():
+    """Rather than taken for zero, as by a penalty on gradients."""
+    arguments = [t.float().requires_grad_() for t in gaussians(6)]
+    loss = native_project(*arguments, looking_down()).means_px.square().sum()
+    (slope,) = torch.autograd.grad(loss, arguments[0], create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        (loss + slope.square().sum()).backward()
+
+
 def test_shapes_that_do_not_belong_together_are_refused():
     means, scales, quaternions = gaussians(3)
     with pytest.raises((ValueError, TypeError)):

@@ -11,13 +11,14 @@ import torch
 from support.rasterize_scenes import (
     Scene,
     assert_close,
+    assert_gradients_of_another_picture_are_refused,
     draw,
     loss_of,
     make_scene,
     splats_of,
 )
 from vdgs.kernels.cpu.extension import load_extension, supported_isas
-from vdgs.kernels.cpu.rasterize import rasterize
+from vdgs.kernels.cpu.rasterize import rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Splats
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 
@@ -83,6 +84,22 @@ def test_equal_depths_keep_the_order_of_the_rows(isa: str) -> None:
     args = (means, conics, colors, torch.full((n,), 0.3), torch.full((n,), 5.0), torch.zeros(3))
     first = draw(Scene(args, 16, 16), isa).image[8, 8]
     assert first[0] > first[1] > first[2]
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_depths_of_either_sign_and_zeros_of_either_keep_the_order_of_the_rows(isa: str) -> None:
+    scene = make_scene(60, 16, 16, opacity=2.0)
+    depths = torch.tensor([-3.0, 0.0, -0.0, 2.0, 2.0]).repeat(12)
+    scene = Scene((*scene.tensors[:4], depths, scene.tensors[5]), 16, 16)
+    exact = reference(*splats_of(scene.to(torch.float64).tensors), 16, 16)
+    assert_close(draw(scene, isa).image, exact.image, 1e-5)
+
+
+@pytest.mark.parametrize("name", ["image", "alpha", "depth"])
+def test_gradients_of_another_picture_are_refused(name: str) -> None:
+    assert_gradients_of_another_picture_are_refused(
+        name, lambda splats, behind: rasterize_vjp(splats, behind, 37, 29, depth=True)[1]
+    )
 
 
 def test_order_of_the_rows_does_not_matter() -> None:

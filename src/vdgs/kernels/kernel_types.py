@@ -85,7 +85,10 @@ class DecoderWeights:
             inputs = FEATURE_SIZE + 3 + int(with_distance)
             layers = ((HIDDEN_SIZE, inputs), (outputs, HIDDEN_SIZE))
             shapes = [(shape, columns**-0.5) for rows, columns in layers for shape in ((rows, columns), (rows,))]
-            drawn = ((torch.rand(shape, generator=generator, dtype=torch.float32), bound) for shape, bound in shapes)
+            drawn = (
+                (torch.rand(shape, generator=generator, dtype=torch.float32, device="cpu"), bound)
+                for shape, bound in shapes
+            )
             return MlpWeights(*((2 * each - 1) * bound for each, bound in drawn))
 
         return DecoderWeights(head(k), head(7 * k), head(3 * k))

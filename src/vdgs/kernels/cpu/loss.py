@@ -57,7 +57,7 @@ def _measure(
         ssim_weight,
         gradient,
     )
-    loss, l1, ssim = (torch.tensor(value, dtype=torch.float32) for value in values)
+    loss, l1, ssim = (torch.tensor(value, dtype=torch.float32, device="cpu") for value in values)
     return loss, l1, ssim
 
 
