@@ -290,7 +290,7 @@ class DensificationStats:
     seen: Float[Tensor, "n"]
 
     @staticmethod
-    def zeros(n: int, k: int, device: torch.device | None = None) -> DensificationStats:
+    def zeros(n: int, k: int, device: torch.device | str = "cpu") -> DensificationStats:
         """Those of anchors that no view has shown yet."""
         shapes = (n, k), (n, k), (n,), (n,)
         return DensificationStats(*(torch.zeros(shape, dtype=torch.float32, device=device) for shape in shapes))
