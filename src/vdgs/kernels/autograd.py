@@ -1,19 +1,38 @@
-"""Shared by the rasterizers: checks of their arguments, and the bridge to autograd and back."""
+"""The bridge to autograd and back; shared by the rasterizers: checks of their arguments."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, Splats
 
 #: The largest picture side: tiles are numbered with 16 bits.
 MAX_IMAGE_SIDE_PX = 16 * 32767
+
+
+def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """The `backward` of a function without second derivatives: RuntimeError where they are asked for.
+
+    That of torch refuses too late: `torch.autograd.grad` by chosen tensors passes its error by, and where gradients do
+    not depend on the tensors it has none. Both take second derivatives for zero.
+    """
+
+    @wraps(backward)
+    def run(ctx: Any, *gradients: Tensor | None) -> Any:
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "trying to differentiate twice what the kernels of vdgs differentiate once: leave out "
+                "create_graph=True, or set VDGS_KERNELS=torch_ref, which is slower"
+            )
+        return backward(ctx, *gradients)
+
+    return run
 
 
 class Drawn(NamedTuple):

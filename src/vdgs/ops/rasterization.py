@@ -106,7 +106,8 @@ def rasterization(
     image's side off its center, as in crops, also within it.
 
     Raises ValueError for shapes that do not fit, TypeError for what is no tensor or array of float32, VdgsError for a
-    size or a degree that is no whole number, UnsupportedOption for absgrad, sparse_grad, distributed, fisheye and
+    size or a degree that is no whole number, RuntimeError on the way back with `create_graph=True`, UnsupportedOption
+    for absgrad, sparse_grad, distributed, fisheye and
     ftheta cameras, distortion, rolling shutter, `with_ut` and `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye
     et al. 2025 for the interface.
     """

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.argument_checks import check_row_shapes
+from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.arguments import contiguous, packed_camera
 from vdgs.kernels.kernel_types import ProjectedGaussians
