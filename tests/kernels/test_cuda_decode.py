@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import inspect
+from copy import copy
 from dataclasses import fields, replace
 from functools import partial
 
@@ -221,6 +223,33 @@ def test_unsuitable_anchors_are_refused():
             decode(scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, turned())
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda scene: replace(scene, features=scene.features[:, :31]),
+        lambda scene: replace(scene, offsets=scene.offsets[:3]),
+        lambda scene: replace(scene, log_scales=scene.log_scales[:, :5]),
+        lambda scene: replace(scene, weights=Scene.random(1, k=9).weights),
+    ],
+)
+def test_shapes_that_do_not_belong_together_are_refused(change):
+    """A kernel does not look again: it would read beyond the end."""
+    wrong = change(Scene.random(4, 4))
+    with pytest.raises(ValueError, match="must be"), torch.no_grad():
+        inspect.unwrap(decode)(
+            wrong.positions, wrong.features, wrong.offsets, wrong.log_scales, wrong.weights, turned()
+        )
+
+
+def test_rows_of_another_type_are_refused():
+    scene = Scene.random(4, 4)
+    with pytest.raises(TypeError, match="rows must be int64"), torch.no_grad():
+        inspect.unwrap(decode)(
+            scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, turned(),
+            torch.arange(4, dtype=torch.int32),
+        )  # fmt: skip
+
+
 def test_the_camera_is_laid_out_as_the_header_says():
     """Field by field, in the header's own order."""
     text = read_header("gaussian_math.h").split("struct Camera {")[1].split("};")[0]
@@ -253,6 +282,19 @@ def with_depths(kernels):
         return kernels(positions, states, weights, camera, rows, deep, updates)
 
     return kernel
+
+
+#: Of a view that shows no splat.
+NONE = SplatGradients(
+    means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colors=torch.zeros(0, 3), opacities=torch.zeros(0),
+    volume=0.0, source=torch.zeros(0).int(), color_values=torch.zeros(0, 3), opacity_values=torch.zeros(0),
+)  # fmt: skip
+
+
+def with_a_color(gradients: SplatGradients) -> SplatGradients:
+    wrong = copy(gradients)  # without the run-time types of the tests
+    object.__setattr__(wrong, "colors", torch.zeros(1, 3))
+    return wrong
 
 
 @needs_a_compiler
@@ -341,10 +383,20 @@ class TestMoving:
     def test_states_that_anneal_apart_are_refused(self, moving):
         scene = Scene.random(4, 3)
         states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
-        nothing = torch.zeros(0)
-        none = SplatGradients(
-            means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colors=torch.zeros(0, 3), opacities=nothing,
-            volume=0.0, source=nothing.int(), color_values=torch.zeros(0, 3), opacity_values=nothing,
-        )  # fmt: skip
         with pytest.raises(ValueError, match="annealed alike"):
-            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), none, torch.zeros(4).int())
+            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), NONE, torch.zeros(4).int())
+
+    @pytest.mark.parametrize(
+        ("spoil", "said"),
+        [
+            (lambda states, none: (states, with_a_color(none)), r"colors must be \[0, 3\]"),
+            (lambda states, none: ([states[0]._replace(first=states[0].first[:3]), *states[1:]], none), "of one shape"),
+            (lambda states, none: ([states[1], states[1], states[2]], none), r"features must be \[4, 32\]"),
+        ],
+    )
+    def test_shapes_that_do_not_belong_together_are_refused(self, spoil, said, moving):
+        scene = Scene.random(4, 3)
+        states, gradients = spoil([AdamState(t, t, t, 0.1) for t in scene.trainable[:3]], NONE)
+        step = partial(inspect.unwrap(moving.func), **moving.keywords)
+        with pytest.raises(ValueError, match=said):
+            step(scene.positions, states, scene.weights, turned(), torch.arange(4), gradients, torch.zeros(4).int())

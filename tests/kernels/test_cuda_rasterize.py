@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import gc
+import weakref
 from dataclasses import fields, replace
 
 import pytest
@@ -21,6 +23,7 @@ from support.rasterize_scenes import (
     Scene,
     assert_close,
     assert_first_gradients_are_those_of_all,
+    assert_gradients_of_another_picture_are_refused,
     assert_same_picture,
     in_runs,
     loss_of,
@@ -201,6 +204,41 @@ class TestMeaning:
         size, (splats, background) = (scene.width, scene.height), splats_of([each.detach() for each in scene.tensors])
         assert_first_gradients_are_those_of_all(
             lambda: rasterize_vjp(splats, background, *size, program=program)[1], len(splats.depths), *size
+        )
+
+    @pytest.mark.parametrize("depth", [False, True])
+    @pytest.mark.parametrize("backward", [False, True])
+    def test_a_picture_that_nobody_holds_is_freed_with_what_its_way_back_keeps(self, backward, depth, library):
+        scene, kept = SCENES["ordinary"].to(torch.float32), []
+
+        class Watched(CudaProgram):
+            def launch(self, kernel, grid, block, *arguments):
+                kept.extend(weakref.ref(each) for each in arguments if isinstance(each, torch.Tensor))
+                super().launch(kernel, grid, block, *arguments)
+
+        given = {id(tensor) for tensor in scene.tensors}
+        program = Watched(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        raster = rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
+        assert any(each() is not None for each in kept)
+        if backward:
+            raster.image.sum().backward()
+        del raster
+        gc.collect()
+        assert not [each() for each in kept if each() is not None and id(each()) not in given]
+
+    def test_a_picture_that_was_changed_has_no_way_back(self, library):
+        """The way back reads the picture: it would give other gradients without a word."""
+        scene = SCENES["ordinary"].to(torch.float32)
+        raster = drawn(scene, library)
+        raster.image.add_(0.5 * (1 - raster.alpha)[..., None])
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            raster.image.sum().backward()
+
+    @pytest.mark.parametrize("name", ["image", "alpha", "depth"])
+    def test_gradients_of_another_picture_are_refused(self, name, library):
+        program = CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        assert_gradients_of_another_picture_are_refused(
+            name, lambda splats, behind: rasterize_vjp(splats, behind, 37, 29, depth=True, program=program)[1]
         )
 
     def test_unsuitable_tensors_are_refused(self, library):

@@ -141,6 +141,16 @@ def test_native_gives_no_gradient_where_none_is_wanted():
     assert all(t.grad is None for t in fixed.weights.tensors())
 
 
+def test_native_refuses_second_derivatives():
+    """Rather than to take them for zero, as by a penalty on gradients."""
+    scene = Scene.random(5)
+    features = scene.features.requires_grad_(True)
+    colors = native_decode(*replace(scene, features=features).arguments, CAMERAS[0]).colors
+    for loss in (colors.square().sum(), colors.sum()):
+        with pytest.raises(RuntimeError, match="differentiate twice"):
+            torch.autograd.grad(loss, features, create_graph=True)
+
+
 def test_native_takes_any_layout_of_memory_and_a_loss_of_one_output():
     scene = Scene.random(40)
     spread_out = replace(scene, features=scene.features.T.contiguous().T)

@@ -160,6 +160,15 @@ def test_the_constants_of_the_kernels_are_those_of_the_twins(isa):
         assert value == pytest.approx(getattr(constants, name), rel=1e-6), name
 
 
+def test_second_derivatives_are_refused_where_there_are_none():
+    """Rather than taken for zero, as by a penalty on gradients; also of a loss whose gradient is a number."""
+    arguments = [t.float().requires_grad_() for t in gaussians(6)]
+    means_px = native_project(*arguments, looking_down()).means_px
+    for loss in (means_px.square().sum(), means_px.sum()):
+        with pytest.raises(RuntimeError, match="differentiate twice"):
+            torch.autograd.grad(loss, arguments[0], create_graph=True)
+
+
 def test_shapes_that_do_not_belong_together_are_refused():
     means, scales, quaternions = gaussians(3)
     with pytest.raises((ValueError, TypeError)):

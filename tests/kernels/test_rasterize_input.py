@@ -11,13 +11,14 @@ import torch
 from support.rasterize_scenes import (
     Scene,
     assert_close,
+    assert_gradients_of_another_picture_are_refused,
     draw,
     loss_of,
     make_scene,
     splats_of,
 )
 from vdgs.kernels.cpu.extension import load_extension, supported_isas
-from vdgs.kernels.cpu.rasterize import rasterize
+from vdgs.kernels.cpu.rasterize import rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Splats
 from vdgs.kernels.torch_ref.rasterize import rasterize as reference
 
@@ -85,6 +86,22 @@ def test_equal_depths_keep_the_order_of_the_rows(isa: str) -> None:
     assert first[0] > first[1] > first[2]
 
 
+@pytest.mark.parametrize("isa", ISAS)
+def test_depths_of_either_sign_and_zeros_of_either_keep_the_order_of_the_rows(isa: str) -> None:
+    scene = make_scene(60, 16, 16, opacity=2.0)
+    depths = torch.tensor([-3.0, 0.0, -0.0, 2.0, 2.0]).repeat(12)
+    scene = Scene((*scene.tensors[:4], depths, scene.tensors[5]), 16, 16)
+    exact = reference(*splats_of(scene.to(torch.float64).tensors), 16, 16)
+    assert_close(draw(scene, isa).image, exact.image, 1e-5)
+
+
+@pytest.mark.parametrize("name", ["image", "alpha", "depth"])
+def test_gradients_of_another_picture_are_refused(name: str) -> None:
+    assert_gradients_of_another_picture_are_refused(
+        name, lambda splats, behind: rasterize_vjp(splats, behind, 37, 29, depth=True)[1]
+    )
+
+
 def test_order_of_the_rows_does_not_matter() -> None:
     scene = make_scene(500, 50, 40)
     order = torch.randperm(500, generator=torch.Generator().manual_seed(0))
@@ -129,9 +146,9 @@ def test_backward_may_be_repeated_but_not_differentiated() -> None:
     first = torch.autograd.grad(raster.image.square().sum(), scene.tensors[:4], retain_graph=True)
     again = torch.autograd.grad(raster.image.square().sum(), scene.tensors[:4], retain_graph=True)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    slope = torch.autograd.grad(raster.image.square().sum(), scene.tensors[0], create_graph=True)[0]
-    with pytest.raises(RuntimeError, match="differentiate twice"):
-        slope.sum().backward()
+    for loss in (raster.image.square().sum(), raster.image.sum()):
+        with pytest.raises(RuntimeError, match="differentiate twice"):
+            torch.autograd.grad(loss, scene.tensors[0], create_graph=True)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from support.fake_device import CARD, pretended_card
+from vdgs.kernels import transfer
 from vdgs.kernels.transfer import COPIES_SHARE, DeviceCopies
 
 WHOLE = (slice(0, 4), slice(0, 6))
@@ -24,6 +25,16 @@ def test_a_picture_comes_to_the_card_once():
         assert part.untyped_storage().data_ptr() == sent.untyped_storage().data_ptr()
         other = copies.part(picture(8), WHOLE, CARD)
         assert (int(sent[0, 0, 0]), int(other[0, 0, 0])) == (7, 8)
+
+
+def test_each_card_has_its_own_copies_and_its_own_room(monkeypatch):
+    sent = []
+    monkeypatch.setattr(transfer, "upload", lambda tensor, device: sent.append(device) or tensor.clone())
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(100 / COPIES_SHARE), 10**9))
+    copies, original, cards = DeviceCopies(), picture(7), [torch.device("cuda", index) for index in (0, 1)]
+    for card in (*cards, *cards):  # of 72 bytes: one on each has room
+        copies.part(original, WHOLE, card)
+    assert sent == cards
 
 
 def test_what_there_is_no_room_for_comes_each_time_until_there_is(monkeypatch):

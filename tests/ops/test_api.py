@@ -15,10 +15,12 @@ import torch
 
 import vdgs
 from support.commands import CommandsHere, small_figures
+from support.fake_device import CARD, pretended_card
 from support.small_pipeline import vdgs as verb
 from vdgs.config.presets import PRESETS
 from vdgs.config.validation_rules import checked_settings
 from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.model.anchor_model import AnchorModel
 
 pytestmark = pytest.mark.xdist_group("api")
 STUB = Path(vdgs.__file__).with_suffix(".pyi")
@@ -231,6 +233,33 @@ def test_the_stages_are_those_of_the_run(run, coarse):
         vdgs.merge(coarse, run.block_scenes[::-1], blocks, assignment)
     with pytest.raises(ValueError, match=r"not \[5 training cameras, 2 blocks\]"):
         vdgs.merge(coarse, run.block_scenes, blocks, vdgs.assign_cameras(coarse, blocks, coarse.cameras[:2]))
+
+
+@pytest.mark.parametrize("decoders", ["frozen", "own"])
+def test_a_scene_on_a_card_is_merged_there(decoders, run, coarse):
+    blocks, cpu = run.block_scenes, torch.device("cpu")
+    if decoders == "frozen":
+        blocks = [vdgs.Scene(with_decoder_of(each.model, coarse.model)) for each in blocks]
+    wanted = vdgs.merge(coarse, blocks, run.blocks, run.assignment)
+    assert bool(wanted.model.decoder_spans) == (decoders == "own")
+    with pretended_card():
+        there, *blocks_there = (vdgs.Scene(each.model.to(CARD), each.capture) for each in (coarse, *blocks))
+        merged = vdgs.merge(there, blocks_there, run.blocks, run.assignment).model
+        parts = merged.anchors, merged.decoder, *(span.decoder for span in merged.decoder_spans)
+        assert {tensor.device for part in parts for tensor in part.tensors().values()} == {CARD}
+        back = vdgs.Scene(merged.to(cpu))
+    assert same(back, wanted)
+
+
+def with_decoder_of(model: AnchorModel, coarse: AnchorModel) -> AnchorModel:
+    return replace(model, decoder=coarse.decoder, metadata=replace(model.metadata, decoder="frozen"))
+
+
+def test_blocks_are_opened_on_the_device_of_the_run(run):
+    with pretended_card():
+        opened = vdgs.open_run(run.path)
+        opened.device = "cuda"
+        assert {each.positions.device for each in (opened.scene, *opened.block_scenes)} == {CARD}
 
 
 def same(one: vdgs.Scene, other: vdgs.Scene) -> bool:

@@ -97,6 +97,15 @@ def test_what_adam_may_not_write_to_is_refused(tmp_path):
     assert (writable < 1).all()
 
 
+def test_a_parameter_of_another_precision_is_named():
+    moved = [np.zeros((4, 3)) for _ in range(3)]
+    with pytest.raises(TypeError, match=r"^parameter must be float32, not torch\.float64"):
+        ops.sparse_adam_(*moved, np.ones((4, 3)), None, 1, lr=0.1)
+    first = [moved[0].astype(np.float32), *moved[1:]]
+    with pytest.raises(TypeError, match=r"^first moment must be .*, torch\.float32, not torch\.float64"):
+        ops.sparse_adam_(*first, np.ones((4, 3)), None, 1, lr=0.1)
+
+
 def test_arrays_of_swapped_bytes_are_read():
     """As PLY files hold them."""
     given = [np.random.default_rng(0).uniform(0.1, 1, (9, n)).astype(np.float32) for n in (3, 4, 3)]

@@ -173,6 +173,25 @@ def test_a_pose_that_may_move_changes_no_picture():
     assert float(apart.mean()) < 1e-5
 
 
+@pytest.mark.parametrize("change", ["scaled", "sheared", "mirrored"])
+def test_poses_that_are_no_rigid_motions_are_drawn_as_they_say(change):
+    """gsplat takes them, and so does the way for poses that move."""
+    given = scene(200, cameras=1)
+    pose = given["viewmats"]
+    pose[0, :3, 3] += torch.tensor([0.3, -0.2, 0.5])
+    if change == "scaled":
+        pose[0, :3] *= 2
+    elif change == "sheared":
+        pose[0, 0, 1] += 0.01
+    else:
+        pose[0, 1] *= -1
+    still, moving = draw(given), draw(given | {"viewmats": pose.clone().requires_grad_(True)})
+    assert torch.equal(still[0], moving[0].detach())
+    local = given["means"] @ pose[0, :3, :3].T + pose[0, :3, 3]
+    wanted = (local @ given["Ks"][0].T)[:, :2] / local[:, 2:]
+    torch.testing.assert_close(still[2]["means2d"], wanted[still[2]["gaussian_ids"]], rtol=1e-4, atol=1e-3)
+
+
 def test_packed_rows_are_those_that_are_drawn():
     found = {}
     for packed in (True, False):

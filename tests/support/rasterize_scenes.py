@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
@@ -13,6 +14,20 @@ from vdgs.kernels.cpu.extension import load_extension
 from vdgs.kernels.cpu.rasterize import rasterize
 from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterPullback, Splats
 from vdgs.kernels.splat_segments import SplatSegments
+
+
+def assert_gradients_of_another_picture_are_refused(
+    name: str, pullback_of: Callable[[Splats, Tensor], RasterPullback]
+) -> None:
+    """For a picture of 37x29 with depth: a smaller one's would be read beyond its end."""
+    tail = (3,) if name == "image" else ()
+    given = dict.fromkeys(("image", "alpha", "depth"))
+    pullback = pullback_of(*splats_of([each.detach() for each in make_scene(9, 37, 29).tensors]))
+    for shape in ((4, 4, *tail), (37, 29, *tail), (1, 29, 37, *tail)):
+        with pytest.raises(ValueError, match=f"the gradient by {name} must have shape .29, 37"):
+            pullback(**given | {name: torch.ones(shape)})
+    with pytest.raises(TypeError, match=f"the gradient by {name} must be float32, not torch.float64"):
+        pullback(**given | {name: torch.ones(29, 37, *tail, dtype=torch.float64)})
 
 
 def assert_first_gradients_are_those_of_all(

@@ -1,7 +1,9 @@
-"""Limits of control groups: of nested ones too, of both versions, as containers and SLURM show them."""
+"""Limits of control groups, of memory and of processors: of nested ones too, of both versions, as containers and SLURM
+show them."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,8 +11,10 @@ import psutil
 import pytest
 
 from vdgs.cli.doctor import system_checks as doctor
+from vdgs.kernels import cpu_count, default_num_threads
+from vdgs.system import cgroups
+from vdgs.system.cgroups import CgroupLimit, cgroup_cpus, cgroup_limits, slurm_memory_limit
 from vdgs.system.memory import process_memory
-from vdgs.system.memory.cgroups import CgroupLimit, cgroup_limits, slurm_memory_limit
 
 GB = 10**9
 #: What version 1 says where there is no limit.
@@ -32,9 +36,15 @@ class Machine:
 
     def limits(self, groups: str) -> list[CgroupLimit]:
         """As seen by a process whose /proc/self/cgroup has these lines."""
+        return cgroup_limits(self._seen_by(groups))
+
+    def cpus(self, groups: str) -> float | None:
+        return cgroup_cpus(self._seen_by(groups))
+
+    def _seen_by(self, groups: str) -> Path:
         (self.folder / "cgroup").write_text(groups)
         (self.folder / "mountinfo").write_text("\n".join(self.mounts) + "\n")
-        return cgroup_limits(self.folder)
+        return self.folder
 
 
 @pytest.fixture
@@ -119,6 +129,36 @@ def test_a_group_that_uses_more_than_its_limit_leaves_nothing_and_needs_no_stati
     second(root, GB, 2 * GB)
     (root / "memory.stat").unlink()
     assert least(machine.limits("0::/")) == 0
+
+
+def test_quotas_of_processors_are_seen_in_version_2(machine, tmp_path):
+    job = machine.mount("cgroup", 2) / "docker/4f"
+    (job / "inner").mkdir(parents=True)
+    assert machine.cpus("0::/docker/4f/inner") is None
+    for folder, text in ((job / "inner", "max 100000"), (job, "150000 100000"), (job.parent, "800000 100000")):
+        (folder / "cpu.max").write_text(f"{text}\n")
+    assert machine.cpus("0::/docker/4f/inner") == 1.5
+    assert machine.cpus("0::/docker") == 8
+    assert machine.cpus("0::/elsewhere") is None
+    assert cgroup_cpus(tmp_path / "nowhere") is None
+
+
+def test_quotas_of_processors_are_seen_in_version_1(machine):
+    cpu, memory = machine.mount("cpu", 0), machine.mount("memory", 1)
+    for folder, quota in ((cpu, -1), (cpu / "job", 50_000), (memory / "job", 10_000)):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "cpu.cfs_quota_us").write_text(f"{quota}\n")
+        (folder / "cpu.cfs_period_us").write_text("100000\n")
+    assert machine.cpus("4:memory:/job\n2:cpu,cpuacct:/job\n") == 0.5
+    assert machine.cpus("4:memory:/job\n2:cpu,cpuacct:/\n") is None
+
+
+@pytest.mark.parametrize(("quota", "threads"), [(None, 8), (0.5, 1), (2.0, 2), (2.5, 3), (64.0, 8)])
+def test_threads_are_as_many_as_a_quota_keeps_busy(quota, threads, monkeypatch):
+    monkeypatch.delenv("VDGS_THREADS", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setattr(cgroups, "cgroup_cpus", lambda: quota)
+    assert cpu_count() == default_num_threads() == threads
 
 
 @pytest.mark.parametrize(

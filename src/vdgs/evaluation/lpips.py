@@ -82,7 +82,9 @@ class Lpips:
 
     @torch.inference_mode()
     def _distance(self, x: Float[Tensor, "1 3 h w"], y: Float[Tensor, "1 3 h w"]) -> float:
-        shift, scale = (torch.tensor(v, dtype=torch.float32).reshape(1, 3, 1, 1) for v in (INPUT_SHIFT, INPUT_SCALE))
+        shift, scale = (
+            torch.tensor(v, dtype=torch.float32, device="cpu").reshape(1, 3, 1, 1) for v in (INPUT_SHIFT, INPUT_SCALE)
+        )
         x, y = (x - shift) / scale, (y - shift) / scale
         total = 0.0
         for number, (layers, head) in enumerate(zip(self._stages, self._heads, strict=True)):

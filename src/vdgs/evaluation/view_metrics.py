@@ -178,7 +178,7 @@ def _render(view: View, model: RenderableModel, draw: Callable[[Camera], Rendere
         _wait_for_gpu()
         seconds = time.perf_counter() - start
         image, alpha = (
-            None if each is None else torch.as_tensor(each).detach().to("cpu", torch.float32).numpy()
+            None if each is None else torch.as_tensor(each, device="cpu").detach().float().numpy()
             for each in (rendered.image, getattr(rendered, "alpha", None))
         )
     assert image is not None

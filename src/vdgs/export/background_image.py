@@ -35,8 +35,8 @@ def write_background(run: OpenedRun, path: Path) -> None:
     from above, rows from straight up to straight down."""
     envmap = run.model.envmap
     assert envmap is not None
-    azimuth = math.pi - (torch.arange(2 * _ROWS) + 0.5) * (math.pi / _ROWS)
-    elevation = math.pi / 2 - (torch.arange(_ROWS)[:, None] + 0.5) * (math.pi / _ROWS)
+    azimuth = math.pi - (torch.arange(2 * _ROWS, device="cpu") + 0.5) * (math.pi / _ROWS)
+    elevation = math.pi / 2 - (torch.arange(_ROWS, device="cpu")[:, None] + 0.5) * (math.pi / _ROWS)
     across, up = elevation.cos(), elevation.sin().expand(_ROWS, 2 * _ROWS)
     directions = torch.stack([across * azimuth.cos(), across * azimuth.sin(), up], dim=-1)
     picture = Image.fromarray(to_8bit(sample_envmap(envmap.detach().cpu(), directions).numpy()))

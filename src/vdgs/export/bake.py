@@ -154,8 +154,8 @@ def _gather_samples(views: BakeViews, wanted: Int[np.ndarray, " m"]) -> _ViewSam
     """How the cameras see the wanted Gaussians, which lie close together in number."""
     columns: list[tuple[Tensor, ...]] = []
     first, last = int(wanted[0]), int(wanted[-1])
-    place_of = torch.full((last - first + 1,), -1, dtype=torch.int32)
-    place_of[torch.from_numpy(wanted - first)] = torch.arange(len(wanted), dtype=torch.int32)
+    place_of = torch.full((last - first + 1,), -1, dtype=torch.int32, device="cpu")
+    place_of[torch.from_numpy(wanted - first)] = torch.arange(len(wanted), dtype=torch.int32, device="cpu")
     for camera, shown in zip(views.cameras, views.contributions, strict=True):
         low, high = index_range(shown.gaussians, first, last + 1)
         if low == high:

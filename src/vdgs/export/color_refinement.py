@@ -51,7 +51,7 @@ class BakedGaussians:
         self.model, self.spool = model, spool
         k = model.anchors.offsets.shape[1]
         #: Which of all that anchors spawn are baked: a file of a part of the scene is compared with that part.
-        self.is_baked = torch.zeros(len(model.anchors) * k, dtype=torch.bool)
+        self.is_baked = torch.zeros(len(model.anchors) * k, dtype=torch.bool, device="cpu")
         self.is_baked[torch.from_numpy(kept)] = True
         #: Where the Gaussians of each anchor begin.
         self.starts = np.searchsorted(kept, np.arange(len(model.anchors) + 1) * k)
@@ -108,7 +108,7 @@ def rows_of_part(baked: BakedGaussians, number: int) -> range:
 def view_residual(baked: BakedGaussians, camera: Camera) -> ColorResidual:
     """What the baked Gaussians do not show of the model's picture."""
     wanted, numbers = baked.render_target(camera)
-    background = torch.tensor(baked.model.background, dtype=torch.float32)
+    background = torch.tensor(baked.model.background, dtype=torch.float32, device="cpu")
     found = get_backend(torch.device("cpu")).splat_contributions(
         _splats(baked.spool, numbers, camera), background, camera.width, camera.height, wanted
     )
@@ -148,7 +148,9 @@ def color_updates(
             directions = torch.nn.functional.normalize(means.index_select(0, here) - _camera_center(camera), dim=1)
             columns.append((here, directions, view.colors[low:high].float(), view.pixels[low:high].float()))
     if not columns:
-        return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3, dtype=torch.float32)
+        return np.zeros(0, np.int64), torch.zeros(
+            0, (baked.spool.degree + 1) ** 2, 3, dtype=torch.float32, device="cpu"
+        )
     numbers, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
     order, counts = sort_segments(numbers, rows.start, len(rows))
     directions, colors, pixels = (column.index_select(0, order) for column in rest)

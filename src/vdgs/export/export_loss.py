@@ -95,7 +95,7 @@ def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
     """What the cameras may show of the pieces, and at least one Gaussian."""
     kept: list[Gaussians] = []
     for piece in pieces:
-        seen = torch.zeros(len(piece), dtype=torch.bool)
+        seen = torch.zeros(len(piece), dtype=torch.bool, device="cpu")
         seen[:1] = not kept
         for camera in cameras:
             seen[visible_gaussian_rows(piece, camera)] = True
@@ -105,7 +105,7 @@ def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
 
 @torch.no_grad()
 def _render_gaussians(gaussians: Gaussians, run: OpenedRun, camera: Camera) -> Float[np.ndarray, "h w 3"]:
-    background: Float[Tensor, "3"] = torch.tensor(run.model.background, dtype=torch.float32)
+    background: Float[Tensor, "3"] = torch.tensor(run.model.background, dtype=torch.float32, device="cpu")
     seen = gaussians.select(visible_gaussian_rows(gaussians, camera))
     raster, _ = render_gaussians(seen, camera, background, seen.sh_degree)
     pixels: np.ndarray = raster.image.numpy()

@@ -48,7 +48,7 @@ def optimize_gaussians(
         name: AdamState(named[name], torch.zeros_like(named[name]), torch.zeros_like(named[name]), each)
         for name, each in rates.items()
     }
-    updates = torch.zeros(len(every), dtype=torch.int32)
+    updates = torch.zeros(len(every), dtype=torch.int32, device="cpu")
     began, steps = clock(), 0
     while (passed := clock() - began) < seconds and steps < max_steps:
         _step(baked, gaussians, next(cameras), states, updates)
@@ -66,7 +66,7 @@ def _step(
     seen = gaussians.select(rows)
     moved = [seen.tensors()[name].requires_grad_() for name in states]
     with torch.enable_grad():
-        background = torch.tensor(baked.model.background, dtype=torch.float32)
+        background = torch.tensor(baked.model.background, dtype=torch.float32, device="cpu")
         raster, _ = render_gaussians(seen, camera, background, gaussians.sh_degree)
         gradients = torch.autograd.grad((raster.image - wanted).square().sum(), moved, materialize_grads=True)
     updates[rows] += 1

@@ -73,7 +73,7 @@ def with_learnt_blur(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 def empty_gaussians(degree: int) -> Gaussians:
     """None, with room for colors of a degree."""
-    wide = torch.zeros(0, 3, dtype=torch.float32)
+    wide = torch.zeros(0, 3, dtype=torch.float32, device="cpu")
     return Gaussians(
         means=wide, log_scales=wide, quaternions=wide.new_zeros(0, 4), opacity_logits=wide.new_zeros(0), sh0=wide,
         shN=wide.new_zeros(0, (degree + 1) ** 2 - 1, 3),

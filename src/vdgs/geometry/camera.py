@@ -130,11 +130,12 @@ class Camera:
         return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
 
-def is_rigid_motion(matrix: np.ndarray) -> bool:
-    """Whether a matrix [4, 4] is a rotation and a translation: finite, without a scale, not mirrored or transposed."""
+def is_rigid_motion(matrix: np.ndarray, tolerance: float = 1e-4) -> bool:
+    """Whether a matrix [4, 4] is a rotation (R Rᵀ = 1 to `tolerance`) and a translation: finite, without a scale, not
+    mirrored or transposed."""
     rotation = matrix[:3, :3]
     finite = bool(np.isfinite(matrix).all()) and np.abs(matrix).max() <= MAX_COORDINATE
-    turned = finite and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    turned = finite and np.allclose(rotation @ rotation.T, np.eye(3), atol=tolerance) and np.linalg.det(rotation) > 0
     return bool(turned and np.allclose(matrix[3], [0, 0, 0, 1]))
 
 

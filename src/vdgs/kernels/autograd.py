@@ -1,33 +1,70 @@
-"""Shared by the rasterizers: checks of their arguments, and the bridge to autograd and back."""
+"""The bridge to autograd and back; shared by the rasterizers: checks of their arguments."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import wraps
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, Splats
 
 #: The largest picture side: tiles are numbered with 16 bits.
 MAX_IMAGE_SIDE_PX = 16 * 32767
-#: From the tensors of splats (`Splats.tensors`) and the background to the image and its pullback.
-RasterizeFn = Callable[[tuple[Tensor, ...]], tuple[Raster, RasterPullback]]
+
+
+def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """The `backward` of a function without second derivatives: RuntimeError where they are asked for.
+
+    That of torch refuses too late: `torch.autograd.grad` by chosen tensors passes its error by, and where gradients do
+    not depend on the tensors it has none. Both take second derivatives for zero.
+    """
+
+    @wraps(backward)
+    def run(ctx: Any, *gradients: Tensor | None) -> Any:
+        if torch.is_grad_enabled():
+            raise RuntimeError(
+                "trying to differentiate twice what the kernels of vdgs differentiate once: leave out "
+                "create_graph=True, or set VDGS_KERNELS=torch_ref, which is slower"
+            )
+        return backward(ctx, *gradients)
+
+    return run
+
+
+class Drawn(NamedTuple):
+    """An image, and the way back from it."""
+
+    raster: Raster
+    #: What the way back reads of the image. Autograd keeps it apart, and sees whether it was changed: a pullback that
+    #: held it would hang on what hangs on it, and neither would ever be freed.
+    read: tuple[Tensor | None, ...]
+    #: From `read` to the pullback.
+    pullback_of: Callable[..., RasterPullback]
+
+    def with_pullback(self) -> tuple[Raster, RasterPullback]:
+        """Where autograd has no part in it."""
+        return self.raster, self.pullback_of(*self.read)
+
+
+#: From the tensors of splats (`Splats.tensors`) and the background to the image.
+RasterizeFn = Callable[[tuple[Tensor, ...]], Drawn]
 
 
 def rasterize_with_autograd(draw: RasterizeFn, splats: Splats, background: Tensor) -> Raster:
-    """The image over a background [3], differentiable once by splats and background; a second derivative raises
-    RuntimeError."""
+    """The image over a background [3], differentiable once by splats and background. RuntimeError for a second
+    derivative, and where what the way back reads of the image was changed."""
     return Raster(*_Drawn.apply(draw, *splats.tensors, background))
 
 
 class _Drawn(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, draw: RasterizeFn, *tensors: Tensor) -> Raster:
-        raster, ctx.pullback = draw(tensors)
+        raster, read, ctx.pullback_of = draw(tensors)
+        ctx.save_for_backward(*read)
         if raster.median_depth is not None:
             ctx.mark_non_differentiable(raster.median_depth)
         ctx.set_materialize_grads(False)
@@ -37,7 +74,7 @@ class _Drawn(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         image, alpha, depth, _ = picture_gradients
-        return None, *ctx.pullback(image, alpha, depth)
+        return None, *ctx.pullback_of(*ctx.saved_tensors)(image, alpha, depth)
 
 
 def vjp_from_autograd(
@@ -88,3 +125,19 @@ def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_ty
             raise TypeError(f"{name} must be float32{where}, not {tensor.dtype} on {tensor.device}")
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+
+
+def check_picture_gradients(
+    height: int, width: int, image: Tensor | None, alpha: Tensor | None, depth: Tensor | None
+) -> None:
+    """Raise TypeError or ValueError unless the gradients that a pullback is given are float32 and of the picture's
+    size: kernels do not look again."""
+    for name, gradient, tail in (("image", image, (3,)), ("alpha", alpha, ()), ("depth", depth, ())):
+        if gradient is None:
+            continue
+        if gradient.dtype != torch.float32:
+            raise TypeError(f"the gradient by {name} must be float32, not {gradient.dtype}")
+        if tuple(gradient.shape) != (height, width, *tail):
+            raise ValueError(
+                f"the gradient by {name} must have shape {[height, width, *tail]}, not {list(gradient.shape)}"
+            )

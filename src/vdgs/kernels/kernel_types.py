@@ -85,7 +85,10 @@ class DecoderWeights:
             inputs = FEATURE_SIZE + 3 + int(with_distance)
             layers = ((HIDDEN_SIZE, inputs), (outputs, HIDDEN_SIZE))
             shapes = [(shape, columns**-0.5) for rows, columns in layers for shape in ((rows, columns), (rows,))]
-            drawn = ((torch.rand(shape, generator=generator, dtype=torch.float32), bound) for shape, bound in shapes)
+            drawn = (
+                (torch.rand(shape, generator=generator, dtype=torch.float32, device="cpu"), bound)
+                for shape, bound in shapes
+            )
             return MlpWeights(*((2 * each - 1) * bound for each, bound in drawn))
 
         return DecoderWeights(head(k), head(7 * k), head(3 * k))
@@ -287,7 +290,7 @@ class DensificationStats:
     seen: Float[Tensor, "n"]
 
     @staticmethod
-    def zeros(n: int, k: int, device: torch.device | None = None) -> DensificationStats:
+    def zeros(n: int, k: int, device: torch.device | str = "cpu") -> DensificationStats:
         """Those of anchors that no view has shown yet."""
         shapes = (n, k), (n, k), (n,), (n,)
         return DensificationStats(*(torch.zeros(shape, dtype=torch.float32, device=device) for shape in shapes))

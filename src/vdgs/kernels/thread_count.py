@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import os
 
 from vdgs.errors import VdgsError
 
 
 def cpu_count() -> int:
-    """The number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """The number of cores that this process may use: those that it is bound to, or fewer where the quota of a control
+    group (a container) is less, rounded up."""
+    from vdgs.system.cgroups import cgroup_cpus  # `import vdgs` does without
+
+    bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = cgroup_cpus()
+    return bound if quota is None else min(bound, math.ceil(quota))
 
 
 def default_num_threads() -> int:

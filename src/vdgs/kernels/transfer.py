@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from collections import Counter
 from collections.abc import MutableMapping
 from typing import Any
 
@@ -18,7 +19,7 @@ COPIES_SHARE = 0.1
 
 def to_like(values: Any, like: Tensor) -> Tensor:
     """A few numbers (an array, or a sequence of floats) on the device of a tensor and in its type."""
-    tensor = values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
+    tensor = values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64, device="cpu")
     return tensor.to(like.device, like.dtype, non_blocking=True)
 
 
@@ -30,14 +31,14 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 class DeviceCopies:
-    """Copies on a card of large tensors of main memory that are asked for again and again, such as photographs. A copy
-    is kept as long as its original is there, while all of them take at most a share of what the card has free when the
+    """Copies on cards of large tensors of main memory that are asked for again and again, such as photographs. A copy
+    is kept as long as its original is there, while all of a card take at most a share of what it has free when its
     first one comes. They hold what the originals held then: these must not change."""
 
     def __init__(self) -> None:
-        self._kept: MutableMapping[Tensor, Tensor] = WeakIdKeyDictionary()
-        self._room: int | None = None
-        self._bytes = 0
+        self._kept: MutableMapping[Tensor, dict[torch.device, Tensor]] = WeakIdKeyDictionary()
+        self._room = dict[torch.device, int]()
+        self._bytes = Counter[torch.device]()
         self._lock = threading.RLock()  # originals are dropped by any thread, at any time
 
     def part(self, tensor: Tensor, inside: tuple[slice, ...], device: torch.device) -> Tensor:
@@ -47,20 +48,21 @@ class DeviceCopies:
 
     def _whole(self, tensor: Tensor, device: torch.device) -> Tensor | None:
         """The copy of all of it; None where there is no room."""
-        if (kept := self._kept.get(tensor)) is not None:
+        if (kept := self._kept.get(tensor, {}).get(device)) is not None:
             return kept
-        if self._room is None:
-            self._room = int(COPIES_SHARE * torch.cuda.mem_get_info(device)[0])
-        if tensor.nbytes + self._bytes > self._room:
+        if device not in self._room:
+            self._room[device] = int(COPIES_SHARE * torch.cuda.mem_get_info(device)[0])
+        if tensor.nbytes + self._bytes[device] > self._room[device]:
             return None
-        self._count(tensor.nbytes)
-        weakref.finalize(tensor, self._count, -tensor.nbytes)
-        self._kept[tensor] = upload(tensor, device)
-        return self._kept[tensor]
+        self._count(device, tensor.nbytes)
+        weakref.finalize(tensor, self._count, device, -tensor.nbytes)
+        copy = upload(tensor, device)
+        self._kept.setdefault(tensor, {})[device] = copy
+        return copy
 
-    def _count(self, change: int) -> None:
+    def _count(self, device: torch.device, change: int) -> None:
         with self._lock:
-            self._bytes += change
+            self._bytes[device] += change
 
 
 def is_host(tensor: Tensor) -> bool:

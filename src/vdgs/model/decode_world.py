@@ -39,10 +39,10 @@ def decode_world(
 ) -> DecodedGaussians:
     """The Gaussians of the anchors of the given rows, differentiable in the decoder's weights and the anchors."""
     k = anchors.offsets.shape[1]
-    ray = anchors.positions[rows] - torch.as_tensor(camera.position).to(anchors.positions)
+    ray = anchors.positions[rows] - torch.as_tensor(camera.position, device="cpu").to(anchors.positions)
     distance = ray.norm(dim=1, keepdim=True)
     level = camera.model == "orthographic"
-    direction = torch.as_tensor(camera.forward).to(ray).expand_as(ray) if level else ray / distance
+    direction = torch.as_tensor(camera.forward, device="cpu").to(ray).expand_as(ray) if level else ray / distance
     inputs = torch.cat([anchors.features[rows], direction, distance], 1)
     covariance = weights.covariance.forward(inputs).unflatten(1, (k, 7))
     opacities = weights.opacity.forward(inputs).tanh()

@@ -51,7 +51,7 @@ class Decoder:
                 tensors[f"{head}_w{layer}"] = _uniform((rows, columns), bound, generator)
                 tensors[f"{head}_b{layer}"] = _uniform((rows,), bound, generator)
         if appearance_dim:
-            tensors["appearance"] = torch.zeros(num_images, appearance_dim, dtype=torch.float32)
+            tensors["appearance"] = torch.zeros(num_images, appearance_dim, dtype=torch.float32, device="cpu")
             tensors["appearance_weight"] = _uniform((HIDDEN_SIZE, appearance_dim), appearance_dim**-0.5, generator)
         return Decoder.from_tensors(tensors)
 
@@ -115,4 +115,4 @@ class Decoder:
 
 
 def _uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) -> Tensor:
-    return torch.empty(shape, dtype=torch.float32).uniform_(-bound, bound, generator=generator)
+    return torch.empty(shape, dtype=torch.float32, device="cpu").uniform_(-bound, bound, generator=generator)

@@ -20,7 +20,7 @@ def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[
     """Unit directions in the ground frame of the rays through the pixel centers of a pinhole camera."""
     x = (torch.arange(camera.width, dtype=torch.float32, device=device) + (0.5 - camera.cx)) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float32, device=device) + (0.5 - camera.cy)) / camera.fy
-    axes = torch.tensor(camera.camera_from_world[:3, :3], dtype=torch.float32).to(device)
+    axes = torch.tensor(camera.camera_from_world[:3, :3], dtype=torch.float32, device="cpu").to(device)
     rays = x[None, :, None] * axes[0] + (y[:, None, None] * axes[1] + axes[2])
     return rays / rays.norm(dim=-1, keepdim=True)
 
@@ -45,7 +45,7 @@ def sample_envmap(
 
 def row_elevations(rows: int) -> Float[Tensor, " rows"]:
     """Elevations of the rows of a map, in radians."""
-    s = torch.linspace(1, -1, rows, dtype=torch.float32)
+    s = torch.linspace(1, -1, rows, dtype=torch.float32, device="cpu")
     return math.pi / 2 * s * s.abs()
 
 

@@ -21,7 +21,7 @@ MAX_FLIGHT_GAP = 8
 
 def zero_exposures(images: int) -> Float[Tensor, "images 3 4"]:
     """Departures of `images` photographs, all zero."""
-    return torch.zeros(images, 3, 4, dtype=torch.float32)
+    return torch.zeros(images, 3, 4, dtype=torch.float32, device="cpu")
 
 
 def exposure_matrix(departures: Float[Tensor, "images 3 4"], image: int) -> Float[Tensor, "3 4"]:

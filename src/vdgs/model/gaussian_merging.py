@@ -80,7 +80,7 @@ def merge_by_moments(
 def single_members(gaussians: Gaussians, color_weights: Float[np.ndarray, " n"] | None = None) -> NodeGaussians:
     """Gaussians to be merged, each of which stands for itself alone. Their colors count by their weights, times
     `color_weights` where given."""
-    one = torch.ones(len(gaussians), dtype=torch.float32)
+    one = torch.ones(len(gaussians), dtype=torch.float32, device="cpu")
     return NodeGaussians(
         **gaussians.tensors(), covers=one, log_weight_mean=torch.from_numpy(gaussian_weights(gaussians)).log().float(),
         log_weight_std=0 * one, color_weight=one if color_weights is None else torch.from_numpy(color_weights).float(),

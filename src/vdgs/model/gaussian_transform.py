@@ -93,7 +93,9 @@ def quaternion_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[Tensor, 
 def multiply_quaternions(left: Float[Tensor, "4"], right: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     """Quaternions (wxyz) of the rotations `right`, each followed by `left`; of the type of `right`."""
     w, x, y, z = left.tolist()
-    matrix = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    matrix = torch.tensor(
+        [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64, device="cpu"
+    )
     # In float64: the last bits of a float32 product depend, on some machines, on how many rows there are.
     return (right.double() @ matrix.T).to(right)
 

@@ -37,7 +37,7 @@ def pixel_sizes(positions: Float[Tensor, "p 3"], camera: Camera) -> Float[Tensor
     focal = max(camera.fx, camera.fy)
     if camera.model == "orthographic":
         return torch.full_like(positions[:, 0], 1.0 / focal)
-    return (positions - torch.as_tensor(camera.position).to(positions)).norm(dim=1) / focal
+    return (positions - torch.as_tensor(camera.position, device="cpu").to(positions)).norm(dim=1) / focal
 
 
 def fit_levels(points: Float[np.ndarray, "p 3"], cameras: Sequence[Camera], count: int) -> tuple[float, ...]:

@@ -126,7 +126,7 @@ class LodScene:
             found.append(self._leaf_values(cut.leaves, camera, of))
         if cut.nodes:
             found += [self._node_values(node, of) for node in cut.nodes if not _are_zero(self._node_factors(node))]
-        return torch.cat(found) if found else torch.zeros(0, dtype=torch.float32)
+        return torch.cat(found) if found else torch.zeros(0, dtype=torch.float32, device="cpu")
 
     def _node_values(self, node: int, of: Callable[[NodeContent, Places], Tensor]) -> Tensor:
         """Values of the merged Gaussians of a node."""
@@ -155,13 +155,13 @@ class LodScene:
             return None
         found = self._factors(("anchors", leaf), lambda: gaussian_means(anchors).flatten(0, 1))
         shape = anchors.offsets.shape[:2]
-        return torch.ones(1, dtype=torch.half).expand(shape) if found is None else found.view(shape)
+        return torch.ones(1, dtype=torch.half, device="cpu").expand(shape) if found is None else found.view(shape)
 
     def _leaf_mask(self, anchors: Anchors, factors: Tensor | None, camera: Camera) -> Tensor | None:
         """Which anchors of a leaf are put together for a view; None: all."""
         mask = None if factors is None else (factors > 0).any(1)
         if self.culls_leaves:
-            seen = torch.zeros(len(anchors), dtype=torch.bool)
+            seen = torch.zeros(len(anchors), dtype=torch.bool, device="cpu")
             seen[cull_anchors(anchors, replace(camera, photograph_pixel=self.model.photograph_pixel))] = True
             mask = seen if mask is None else mask & seen
         return mask
@@ -232,7 +232,7 @@ def _held(
 def model_of_rows(model: AnchorModel, anchors: Anchors, rows: Int[Tensor, " r"]) -> AnchorModel:
     """The anchors of some rows of a model, ascending, each with its decoder there."""
     spans = model.decoder_spans
-    ends = torch.tensor([0, *(span.count for span in spans)], dtype=torch.int64).cumsum(0)
+    ends = torch.tensor([0, *(span.count for span in spans)], dtype=torch.int64, device="cpu").cumsum(0)
     bounds = torch.searchsorted(rows.long(), ends).tolist()
     parts = (replace(span, count=last - first) for span, first, last in zip(spans, bounds, bounds[1:], strict=False))
     return replace(model, anchors=anchors, decoder_spans=tuple(parts))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -128,7 +128,8 @@ class Run:
         """The trained blocks, each with the anchors that it moves. Raises RunError where one is not trained."""
         key, capture = self.folder.keys().blocks, self.scene.capture
         stages = [self.folder.block(index) for index in range(len(self.blocks))]
-        return [Scene(load_verified(stage, key, index), capture) for index, stage in enumerate(stages)]
+        models = (load_verified(stage, key, index) for index, stage in enumerate(stages))
+        return [Scene(model.to(torch.device(self.device)), capture) for model in models]
 
 
 def open_run(
@@ -320,6 +321,7 @@ def merge(
     """One scene from trained blocks: every place takes its anchors from exactly one block.
 
     `scene` is the coarse scene that the blocks were trained from; the rows of `assignment` are its training cameras.
+    The merged scene is on its device, wherever the blocks are.
     Raises VdgsError for blocks of another coarse scene or in another order, ValueError where the numbers do not fit,
     TypeError for arguments of another kind.
     """
@@ -336,8 +338,9 @@ def merge(
             f"{len(blocks)} blocks]"
         )
     served = [[cameras[i] for i in np.flatnonzero(of_block)] for of_block in assignment.cameras.T]
-    models = [each.model for each in block_scenes]
-    return Scene(merge_blocks(scene.model, models, blocks, served, settings)[0], scene.capture)
+    cpu, device = torch.device("cpu"), scene.positions.device
+    models = [partial(each.model.to, cpu) for each in block_scenes]  # one block at a time
+    return Scene(merge_blocks(scene.model.to(cpu), models, blocks, served, settings)[0].to(device), scene.capture)
 
 
 def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:

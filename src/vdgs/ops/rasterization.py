@@ -14,7 +14,7 @@ from torch import Tensor
 from vdgs.config.ranges import MAX_COUNT, Range
 from vdgs.config.validation_rules import checked_value
 from vdgs.errors import UnsupportedOption
-from vdgs.geometry.camera import NEAR_PLANE, Camera
+from vdgs.geometry.camera import NEAR_PLANE, Camera, is_rigid_motion
 from vdgs.kernels import KERNELS_ENV_VAR, get_backend
 from vdgs.kernels.constants import ALPHA_MIN, DILATION_PX2
 from vdgs.kernels.gaussian_projection import GaussianShapes, project_gaussians
@@ -26,6 +26,8 @@ RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
 #: Beyond so many standard deviations no Gaussian is drawn (gsplat): alpha is below 1/255 there.
 MAX_EXTENT = 3.33
+#: How far from a rotation a pose may be for the kernels, which take -Rᵀ t for the camera's center.
+RIGID_TOLERANCE = 1e-5
 #: What gsplat's keyword arguments must be here, and what to do instead.
 UNSUPPORTED: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "sparse_grad": ((False,), "gradients are dense; use `sparse_adam_` with the rows of meta['gaussian_ids']"),
@@ -89,7 +91,8 @@ def rasterization(
       the two, covars [..., N, 3, 3]; opacities [..., N] in [0, 1];
     - colors [..., (C,) N, D], any D; with `sh_degree` (0 to 3) coefficients [..., (C,) N, K, 3], drawn as
       max(0, 1/2 + Σ c Y);
-    - viewmats [..., C, 4, 4] (camera from world), Ks [..., C, 3, 3] (no skew); backgrounds [..., C, D].
+    - viewmats [..., C, 4, 4] (camera from world; slower with a scale), Ks [..., C, 3, 3] (no skew); backgrounds
+      [..., C, D].
 
     Returns the picture [..., C, height, width, X], alpha [..., C, height, width, 1] and `meta`. X is D for `RGB`, 1 for
     `D` (Σ w z) and `ED` (Σ w z / Σ w), D + 1 for `RGB+D` and `RGB+ED`. `meta` has gsplat's keys but those of its tiles
@@ -103,7 +106,8 @@ def rasterization(
     image's side off its center, as in crops, also within it.
 
     Raises ValueError for shapes that do not fit, TypeError for what is no tensor or array of float32, VdgsError for a
-    size or a degree that is no whole number, UnsupportedOption for absgrad, sparse_grad, distributed, fisheye and
+    size or a degree that is no whole number, RuntimeError on the way back with `create_graph=True`, UnsupportedOption
+    for absgrad, sparse_grad, distributed, fisheye and
     ftheta cameras, distortion, rolling shutter, `with_ut` and `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye
     et al. 2025 for the interface.
     """
@@ -297,7 +301,8 @@ def _project_image(gaussians: _Gaussians, settings: _Settings, batch: int, index
     )
     moved = pose.requires_grad and torch.is_grad_enabled()
     plain = settings.eps2d == DILATION_PX2 and settings.near >= NEAR_PLANE and not settings.antialiased
-    if scales is not None and quats is not None and plain and not moved:
+    plain = plain and not moved and is_rigid_motion(camera.camera_from_world, RIGID_TOLERANCE)
+    if scales is not None and quats is not None and plain:
         projected = get_backend(means.device).project(means, scales, quats, camera)
     else:
         limits = (settings.near, settings.far)

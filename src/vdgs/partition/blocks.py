@@ -32,7 +32,8 @@ Places = TypeVar("Places", Tensor, np.ndarray)
 
 def xy_positions(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """x and y of anchors in float64, the form in which owners are looked up: the same bits have the same owner."""
-    return torch.as_tensor(positions)[:, :2].double().cpu().numpy()
+    places = torch.from_numpy(positions) if isinstance(positions, np.ndarray) else positions
+    return places[:, :2].double().cpu().numpy()
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,7 +158,7 @@ def time_steps(stage: TrainingProblem, anchors: Anchors, fit_exposures: bool) ->
     """
     full, slowdown = _step_cost(stage, anchors, 1, fit_exposures)
     fewer_pixels, _ = _step_cost(stage, anchors, SMALL_FACTOR, fit_exposures)
-    half = anchors.select(torch.arange(len(anchors)) % 2 == 0)
+    half = anchors.select(torch.arange(len(anchors), device="cpu") % 2 == 0)
     fewer_anchors = _step_cost(stage, half, 1, fit_exposures)[0] if len(half) else full
     cameras = [stage.images.camera(0, factor) for factor in (1, SMALL_FACTOR)]
     large, less = (camera.width * camera.height for camera in cameras)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from vdgs.captures.output_guard import check_output
 from vdgs.captures.split_lists import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.kernels import cpu_count
 from vdgs.synth.dataset_writer import (
     write_cameras,
     write_flight,
@@ -108,7 +108,7 @@ def _write_capture(folder: Path, options: ResolvedOptions, on_progress: Progress
     town = build_town(options.seed, options.extent_m, options.moving_water)
     tracer = RayTracer(town.mesh)
     on_progress("town", 1, 1)
-    with ThreadPoolExecutor(options.workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(options.workers or cpu_count()) as pool:
         sky = make_sky_map(tracer, town.terrain, town.zones, options.extent_m / 2 + 40, pool)
         sky = replace(sky, is_cloudy=options.flight == "horizon")
         views, stats = _plan_views(town, tracer, options)

@@ -74,7 +74,7 @@ def read_tensors_unchecked(path: Path) -> dict[str, Tensor]:
         entries.pop("__metadata__", None)
         tensors = {}
         for name, entry in sorted(entries.items(), key=lambda item: item[1]["data_offsets"]):
-            tensor = torch.empty(entry["shape"], dtype=DTYPES[entry["dtype"]])
+            tensor = torch.empty(entry["shape"], dtype=DTYPES[entry["dtype"]], device="cpu")
             begin, end = entry["data_offsets"]
             if end - begin != tensor.nbytes or file.readinto(_bytes_of(tensor)) != tensor.nbytes:
                 raise ValueError(f"{name} has not the {tensor.nbytes} bytes of its shape")

@@ -110,7 +110,7 @@ class CompensatedGrowth:
             if self.verbose:
                 print(f"Step {step}: {grown} Gaussians added, {pruned} removed, {len(params['means'])} now")
         if step > 0 and step % self.reset_every == 0:
-            limit = torch.tensor(2 * self.prune_opa, dtype=torch.float32).logit().item()
+            limit = torch.tensor(2 * self.prune_opa, dtype=torch.float32, device="cpu").logit().item()
             every = torch.arange(len(params["opacities"]), device=params["opacities"].device)
             changed = {"opacities": params["opacities"].clamp(max=limit)}
             _replace(params, optimizers, {}, every, torch.ones_like(every, dtype=torch.bool), changed)
@@ -166,7 +166,7 @@ class CompensatedGrowth:
     def _split(self, params: Params, parts: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         """What parts of split Gaussians have that their parents have not: places are drawn from the parent."""
         scales = params["scales"][parts].exp()
-        drawn = torch.randn(len(parts), 3, generator=generator, dtype=torch.float32).to(scales) * scales
+        drawn = torch.randn(len(parts), 3, generator=generator, dtype=torch.float32, device="cpu").to(scales) * scales
         moved = torch.einsum("pij,pj->pi", rotation_matrices(params["quats"][parts]), drawn)
         changed = {"means": params["means"][parts] + moved, "scales": (scales / SPLIT_SHRINK).log()}
         if self.revised_opacity:  # two parts let as much light through as their parent (arXiv:2404.06109)

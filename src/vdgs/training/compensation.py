@@ -40,7 +40,7 @@ class CompensationState:
     drawn_before: Float[Tensor, "n k"]
 
     @staticmethod
-    def zeros(n: int, k: int, device: torch.device | None = None) -> CompensationState:
+    def zeros(n: int, k: int, device: torch.device | str = "cpu") -> CompensationState:
         return CompensationState(*(torch.zeros(n, k, device=device, dtype=torch.float32) for _ in range(3)))
 
     def tensors(self) -> dict[str, Tensor]:

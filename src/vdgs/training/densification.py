@@ -203,10 +203,10 @@ def _grow(
 def _random(index: Int64[Tensor, " p"], count: int, generator: torch.Generator) -> Float[Tensor, " p"]:
     """The numbers at `index` (ascending) of `count` uniform random numbers."""
     here = index.cpu()  # drawn on the CPU: the same numbers for any device
-    numbers = torch.empty(len(index), dtype=torch.float32)
+    numbers = torch.empty(len(index), dtype=torch.float32, device="cpu")
     done = 0
     for start in range(0, count, RANDOM_CHUNK):
-        chunk = torch.rand(min(RANDOM_CHUNK, count - start), generator=generator, dtype=torch.float32)
+        chunk = torch.rand(min(RANDOM_CHUNK, count - start), generator=generator, dtype=torch.float32, device="cpu")
         end = int(torch.searchsorted(here, start + len(chunk)))
         numbers[done:end] = chunk[here[done:end] - start]
         done = end

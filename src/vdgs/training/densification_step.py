@@ -55,7 +55,7 @@ def densify(state: TrainingState, stage: TrainingProblem) -> Growth:
 def _compensate(state: TrainingState, stage: TrainingProblem) -> tuple[CompensatedGradient | None, Tensor, float]:
     """Close a cycle of compensated growth (eqs. 8-10): what is added for whom, c_k, and the T_low used."""
     if state.compensation is None:
-        return None, torch.zeros(0, dtype=torch.float32), 0.0
+        return None, torch.zeros(0, dtype=torch.float32, device="cpu"), 0.0
     config = stage.config
     cameras = [stage.images.camera(view) for view in views_in_cycle(state.iteration, stage)]
     share = visibility_ratio(state.anchors.positions, cameras)

@@ -35,11 +35,14 @@ def mean_image_color(
 
 def background_at(stage: TrainingProblem, iteration: int) -> Tensor:
     """Color [3] behind the scene at this iteration (from 0): from its own to a random one of the RGB cube."""
-    color, share = torch.tensor(stage.background, dtype=torch.float32), stage.config.loss.random_background
+    color, share = (
+        torch.tensor(stage.background, dtype=torch.float32, device="cpu"),
+        stage.config.loss.random_background,
+    )
     if share:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
         # Drawn on the CPU: the same colors for any device.
-        color = torch.lerp(color, torch.rand(3, generator=generator, dtype=torch.float32), share)
+        color = torch.lerp(color, torch.rand(3, generator=generator, dtype=torch.float32, device="cpu"), share)
     return color.to(stage.device, non_blocking=True)
 
 
@@ -49,7 +52,12 @@ def opacity_factors_at(stage: TrainingProblem, iteration: int, count: int) -> Fl
     if not deviation:
         return None
     generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
-    noise = torch.randn(count, generator=generator, dtype=torch.float32).mul_(deviation).add_(1.0).clamp_(min=0.0)
+    noise = (
+        torch.randn(count, generator=generator, dtype=torch.float32, device="cpu")
+        .mul_(deviation)
+        .add_(1.0)
+        .clamp_(min=0.0)
+    )
     return noise.to(stage.device, non_blocking=True)
 
 

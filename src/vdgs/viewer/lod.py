@@ -63,7 +63,7 @@ def decimation_factor(level: int) -> int:
 def decimate(model: AnchorModel, factor: int) -> LodLevel:
     """One anchor of so many, by chance but always the same, its Gaussians so much larger that they cover as much."""
     count, device = len(model.anchors), model.anchors.positions.device
-    chance = torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float32)
+    chance = torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu")
     kept = (chance < 1 / factor).to(device)
     fewer = model.select_anchors(kept)
     log_scales = fewer.anchors.log_scales.clone()

@@ -158,7 +158,7 @@ def _array(content: JsonObject, key: str, shape: tuple[int, ...], file: Path) ->
     import torch
 
     try:
-        array = torch.as_tensor(content[key]).detach().to(torch.float64).numpy().reshape(shape)
+        array = torch.as_tensor(content[key], device="cpu").detach().to(torch.float64).numpy().reshape(shape)
     except (KeyError, TypeError, ValueError, RuntimeError):
         raise CaptureError(f"{file}: needs {key!r} of shape {list(shape)}. Copy the file again.") from None
     if not np.isfinite(array).all():

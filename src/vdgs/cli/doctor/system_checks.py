@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
+from vdgs.kernels import cpu_count
 from vdgs.system.broken_packages import import_reason, reinstall_command
+from vdgs.system.cgroups import cgroup_limits
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES
-from vdgs.system.memory.cgroups import cgroup_limits
 from vdgs.system.stop_signals import preserve_signal_handlers
 from vdgs.system.units import data_size
 
@@ -79,8 +80,7 @@ def _processor() -> list[SystemCheck]:
     info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
     model = re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE)
     name = model.group(1) if model else platform.processor() or platform.machine()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return [SystemCheck("processor", "ok", f"{name}, {cores} of {os.cpu_count()} cores usable")]
+    return [SystemCheck("processor", "ok", f"{name}, {cpu_count()} of {os.cpu_count()} cores usable")]
 
 
 def _kernels() -> list[SystemCheck]:

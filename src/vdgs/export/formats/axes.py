@@ -64,9 +64,9 @@ def _mirrored(gaussians: Gaussians) -> Gaussians:
     signs = [(-1.0) ** (band + order) for band in range(1, degree + 1) for order in range(-band, band + 1)]
     return replace(
         gaussians,
-        means=gaussians.means * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float32),
-        quaternions=gaussians.quaternions * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float32),
-        shN=gaussians.shN * torch.tensor(signs, dtype=torch.float32).reshape(1, -1, 1),
+        means=gaussians.means * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float32, device="cpu"),
+        quaternions=gaussians.quaternions * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float32, device="cpu"),
+        shN=gaussians.shN * torch.tensor(signs, dtype=torch.float32, device="cpu").reshape(1, -1, 1),
     )
 
 

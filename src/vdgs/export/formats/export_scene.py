@@ -104,7 +104,9 @@ class ExportScene:
             if chunk.sh_degree != self.degree:
                 raise ValueError(f"a chunk has degree {chunk.sh_degree}, announced was {self.degree}")
             for start in range(0, len(chunk), CHUNK_SIZE):
-                piece = _clean(chunk.select(torch.arange(start, min(start + CHUNK_SIZE, len(chunk)))), done)
+                piece = _clean(
+                    chunk.select(torch.arange(start, min(start + CHUNK_SIZE, len(chunk)), device="cpu")), done
+                )
                 yield axes.of_ground(piece)
                 done += len(piece)
         if done != self.count:

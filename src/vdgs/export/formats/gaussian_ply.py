@@ -149,7 +149,9 @@ def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in wanted], -1))
 
     n = len(table)
-    coefficients = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0, dtype=torch.float32)
+    coefficients = (
+        columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0, dtype=torch.float32, device="cpu")
+    )
     return Gaussians(
         means=columns("x", "y", "z"), log_scales=columns(*SCALE_NAMES), quaternions=columns(*ROTATION_NAMES),
         opacity_logits=columns("opacity")[:, 0], sh0=columns(*DC_NAMES),

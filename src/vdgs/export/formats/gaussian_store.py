@@ -69,7 +69,7 @@ class GaussianStore:
         """Write Gaussians in place of those of the given rows."""
         for first in range(0, len(rows), CHUNK_SIZE):
             part = slice(first, first + CHUNK_SIZE)
-            self.table[rows[part]] = flatten(gaussians.select(torch.arange(len(gaussians))[part]))
+            self.table[rows[part]] = flatten(gaussians.select(torch.arange(len(gaussians), device="cpu")[part]))
             self.means[rows[part]] = gaussians.means[part].numpy()
 
     def sample(self, max_count: int) -> Gaussians:

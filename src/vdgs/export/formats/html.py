@@ -133,14 +133,16 @@ def read_html_chunks(path: Path) -> Iterator[Gaussians]:
 
 def _without_sh(scene: ExportScene) -> Gaussians:
     """All of a scene in memory, without the coefficients that are not shown: 56 bytes each."""
-    parts = [replace(piece, shN=torch.zeros(len(piece), 0, 3, dtype=torch.float32)) for piece in scene.pieces()]
+    parts = [
+        replace(piece, shN=torch.zeros(len(piece), 0, 3, dtype=torch.float32, device="cpu")) for piece in scene.pieces()
+    ]
     return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
 
 
 def html_capacity(gaussians: Gaussians, page: InitialView) -> int:
     """How many like these a page has room for, by a sample of them. Raises VdgsError for next to none."""
     sampled = min(SAMPLE_GAUSSIANS, len(gaussians))
-    some = gaussians.select(torch.linspace(0, len(gaussians) - 1, sampled, dtype=torch.float32).long())
+    some = gaussians.select(torch.linspace(0, len(gaussians) - 1, sampled, dtype=torch.float32, device="cpu").long())
     frame = _frame_bytes()
     factor = length_factor(some)
     each = SIZE_MARGIN * len(_recording(packed_rows(some, factor), factor, page)) / len(some)
@@ -189,7 +191,8 @@ def _unpacked(rows: UInt32[np.ndarray, "n 8"], factor: float) -> Gaussians:
     return Gaussians(
         means=torch.from_numpy(np.ascontiguousarray(rows[:, :3]).view(np.float32) / np.float32(factor)),
         log_scales=log_scales.float(), quaternions=quaternions.float(), opacity_logits=logits_from_opacity(rgba[:, 3]),
-        sh0=rgb_to_sh(torch.from_numpy(rgba[:, :3])), shN=torch.zeros(len(rows), 0, 3, dtype=torch.float32),
+        sh0=rgb_to_sh(torch.from_numpy(rgba[:, :3])),
+        shN=torch.zeros(len(rows), 0, 3, dtype=torch.float32, device="cpu"),
     )  # fmt: skip
 
 

@@ -6,11 +6,12 @@ the other would be valid gzip too, but readers of SPZ stop after the first.
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+
+from vdgs.kernels import cpu_count
 
 BLOCK_BYTES = 1 << 20
 #: Quantised numbers deflate hardly better at higher levels, in five times the time.
@@ -21,7 +22,7 @@ GZIP_HEADER = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\xff"
 def gzip_blocks(data: Iterable[bytes], level: int = COMPRESSION_LEVEL) -> Iterator[bytes]:
     """The pieces of a gzip file that holds the concatenated data. No more than a few blocks are in memory."""
     checksum, size = 0, 0
-    workers = max(1, min(8, os.cpu_count() or 1))
+    workers = min(8, cpu_count())
     yield GZIP_HEADER
     with ThreadPoolExecutor(workers) as pool:
         under_way: deque[Future[bytes]] = deque()

@@ -24,7 +24,7 @@ def canonicalize_quaternions(gaussians: Gaussians) -> Gaussians:
     group, columns = _axis_permutations()
     q = gaussians.quaternions
     # w of the product q p is the dot product of q with the conjugate of p.
-    best = (q @ (group * torch.tensor([1.0, -1, -1, -1], dtype=torch.float32)).T).abs().argmax(1)
+    best = (q @ (group * torch.tensor([1.0, -1, -1, -1], dtype=torch.float32, device="cpu")).T).abs().argmax(1)
     w, x, y, z = q.unbind(-1)
     # Row k: what component k of p contributes to the product.
     spread = torch.stack([w, x, y, z, -x, w, z, -y, -y, -z, w, x, -z, y, -x, w], -1).reshape(-1, 4, 4)
@@ -39,8 +39,11 @@ def canonicalize_quaternions(gaussians: Gaussians) -> Gaussians:
 @lru_cache(maxsize=1)
 def _axis_permutations() -> tuple[Float[Tensor, "24 4"], Tensor]:
     """Quaternions (wxyz) of the 24 rotations of a cube, and which old axis each makes the first, second and third."""
-    units = torch.eye(4, dtype=torch.float32)
+    units = torch.eye(4, dtype=torch.float32, device="cpu")
     pairs = [units[i] + sign * units[j] for i, j in itertools.combinations(range(4), 2) for sign in (1, -1)]
-    halves = [torch.tensor([1.0, *signs], dtype=torch.float32) for signs in itertools.product((1.0, -1.0), repeat=3)]
+    halves = [
+        torch.tensor([1.0, *signs], dtype=torch.float32, device="cpu")
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    ]
     group = torch.nn.functional.normalize(torch.stack([*units, *pairs, *halves]), dim=-1)
     return group, rotation_matrices(group).abs().argmax(1)

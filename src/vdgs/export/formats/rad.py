@@ -129,7 +129,7 @@ def _chunk(tree: GaussianTree, first: int, degree: int) -> bytes:
 
 def _columns(tree: GaussianTree, rows: slice, degree: int) -> Iterator[tuple[JsonObject, bytes]]:
     """What is said of each quantity, and its numbers, one axis after the other."""
-    part = tree.gaussians.select(torch.arange(len(tree.counts))[rows])
+    part = tree.gaussians.select(torch.arange(len(tree.counts), device="cpu")[rows])
     places = np.ascontiguousarray(part.means.numpy().T.astype("<f4"))
     by_byte = places.view(np.uint8).reshape(*places.shape, 4).transpose(2, 0, 1)
     yield {"property": "center", "encoding": "f32_lebytes"}, by_byte.tobytes()

@@ -76,5 +76,5 @@ def _gaussians(table: np.ndarray) -> Gaussians:
         quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128),
         opacity_logits=logits_from_opacity(rgba[:, 3]),
         sh0=rgb_to_sh(torch.from_numpy(rgba[:, :3])),
-        shN=torch.zeros(len(table), 0, 3, dtype=torch.float32),
+        shN=torch.zeros(len(table), 0, 3, dtype=torch.float32, device="cpu"),
     )

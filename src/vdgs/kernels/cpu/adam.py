@@ -28,11 +28,11 @@ def adam_rows(
 
     Raises ValueError also where one of those is not contiguous. Same bits for any number of threads.
     """
+    if state.parameter.dtype != torch.float32:  # else one of the others would be told to be of its type
+        raise TypeError(f"parameter must be float32, not {state.parameter.dtype}")
     check_rows(state, rows, gradient)
     factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
     tensors = state[:3]
-    if state.parameter.dtype != torch.float32:
-        raise TypeError(f"parameter must be float32, not {state.parameter.dtype}")
     if not all(tensor.is_contiguous() for tensor in tensors):
         raise ValueError("parameter, first moment and second moment must be contiguous")
     if gradient.numel() == 0:

@@ -1,4 +1,4 @@
-"""What the C++ kernels ask of their arguments: float32, contiguous, in main memory, of the right shape."""
+"""What the C++ kernels ask of their arguments: float32, contiguous, in main memory."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def contiguous(tensor: Tensor) -> Tensor:
 
 
 def new_floats(*shape: int) -> Tensor:
-    """What a kernel fills, whatever torch's default dtype is."""
-    return torch.empty(shape, dtype=torch.float32)
+    """What a kernel fills, whatever torch's default dtype and device are."""
+    return torch.empty(shape, dtype=torch.float32, device="cpu")
 
 
 def check_outputs(**arguments: Tensor) -> None:
@@ -29,10 +29,3 @@ def check_outputs(**arguments: Tensor) -> None:
 def packed_camera(camera: Camera) -> Tensor:
     """The camera as the kernels read it, [23] float32."""
     return torch.from_numpy(camera.packed)
-
-
-def check_row_shapes(rows: int, **arguments: tuple[Tensor, int]) -> None:
-    """Raise ValueError unless every named tensor is [rows, its width]: the kernels do not look again."""
-    for name, (tensor, width) in arguments.items():
-        if tuple(tensor.shape) != (rows, width):
-            raise ValueError(f"{name} must be [{rows}, {width}], not {list(tensor.shape)}")

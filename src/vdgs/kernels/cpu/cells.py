@@ -16,7 +16,7 @@ __all__ = ["cell_centers", "cell_keys", "contains", "group_cells", "group_max", 
 def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]) -> Int64[Tensor, "n"]:
     """As `torch_ref.cell_keys`."""
     reference.check_lattice(positions, cell_size, origin)
-    keys = torch.empty(positions.shape[0], dtype=torch.int64)
+    keys = torch.empty(positions.shape[0], dtype=torch.int64, device="cpu")
     exact = origin.detach().to(torch.float64).contiguous()
     if not extension.get_extension().cell_keys(positions.detach().contiguous(), cell_size, exact, keys):
         raise ValueError(reference.lattice_range_message(cell_size))
@@ -36,7 +36,7 @@ def contains(table: Int64[Tensor, "a"], query: Int64[Tensor, "b"]) -> Bool[Tenso
     """As `torch_ref.contains`, by open addressing."""
     reference.check_keys(table)
     reference.check_keys(query)
-    result = torch.empty(query.shape[0], dtype=torch.bool)
+    result = torch.empty(query.shape[0], dtype=torch.bool, device="cpu")
     extension.get_extension().contains(table.contiguous(), query.contiguous(), result)
     return result
 
@@ -52,7 +52,7 @@ def group_max(values: Float[Tensor, "n d"], group: Int64[Tensor, "n"], count: in
 def morton_order(positions: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
     """As `torch_ref.morton_order`, by radix sort."""
     reference.check_positions(positions)
-    order = torch.empty(positions.shape[0], dtype=torch.int64)
+    order = torch.empty(positions.shape[0], dtype=torch.int64, device="cpu")
     if positions.shape[0]:
         extension.get_extension().morton_order(positions.detach().contiguous(), order)
     return order

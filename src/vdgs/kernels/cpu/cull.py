@@ -7,8 +7,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.argument_checks import check_row_shapes
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
+from vdgs.kernels.cpu.arguments import contiguous, packed_camera
 
 
 def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
@@ -18,6 +19,6 @@ def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], came
     visible = extension.get_extension().cull(
         contiguous(positions.detach()), contiguous(log_scales.detach()), packed_camera(camera)
     )
-    indices = torch.empty(visible.count, dtype=torch.int64)
+    indices = torch.empty(visible.count, dtype=torch.int64, device="cpu")
     visible.write(indices)
     return indices

@@ -9,9 +9,11 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.argument_checks import check_anchor_shapes
+from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cpu import extension
-from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
-from vdgs.kernels.kernel_types import FEATURE_SIZE, AnchorSplats, DecoderWeights, TrainingSplats
+from vdgs.kernels.cpu.arguments import contiguous, packed_camera
+from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights, TrainingSplats
 from vdgs.kernels.torch_ref.adam import check_indices
 
 
@@ -28,7 +30,7 @@ def decode(
 
     Backward computes hidden layers again, and only the gradients that are needed; same bits for any number of threads.
     `rows` ascend without repetition; anchors are gathered only if autograd follows. Raises ValueError for shapes that
-    do not match or k > 32, IndexError for a row outside the anchors.
+    do not match or k > 32, IndexError for a row outside the anchors, RuntimeError for second derivatives.
     """
     check_anchors(positions, features, offsets, log_scales)
     tensors: tuple[Tensor, ...] = (positions.detach(), features, offsets, log_scales)
@@ -62,13 +64,7 @@ def check_anchors(positions: Tensor, features: Tensor, offsets: Tensor, log_scal
     k = offsets.shape[1]
     if not 1 <= k <= extension.get_extension().max_offsets:
         raise ValueError(f"offsets per anchor must be 1 to {extension.get_extension().max_offsets}, not {k}")
-    check_row_shapes(
-        positions.shape[0],
-        positions=(positions, 3),
-        features=(features, FEATURE_SIZE),
-        offsets=(offsets.flatten(1), 3 * k),
-        log_scales=(log_scales, 6),
-    )
+    check_anchor_shapes(positions, features, offsets, log_scales)
 
 
 class _Decode(torch.autograd.Function):
@@ -82,6 +78,7 @@ class _Decode(torch.autograd.Function):
         return *splats, source
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         camera, *inputs, source, colors, opacities = (t.detach() for t in ctx.saved_tensors)
         wanted = ctx.needs_input_grad[2:]

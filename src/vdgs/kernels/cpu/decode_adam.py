@@ -10,9 +10,10 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.argument_checks import check_splat_gradients
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.adam import round_factors
-from vdgs.kernels.cpu.arguments import check_row_shapes, contiguous, packed_camera
+from vdgs.kernels.cpu.arguments import contiguous, packed_camera
 from vdgs.kernels.cpu.decode import check_anchors
 from vdgs.kernels.kernel_types import AdamState, DecoderWeights, SplatGradients
 from vdgs.kernels.splat_segments import sources_tensor
@@ -46,7 +47,7 @@ def decode_backward_adam(
                 raise ValueError("parameter and moments must be contiguous float32 of one shape")
     source = sources_tensor(gradients.source)
     check_sources(source, rows, offsets.shape[1])
-    _check_splats(gradients)
+    check_splat_gradients(gradients)
     steps = [_step(state) for state in moved]
     heads = [contiguous(t.detach()) for t in weights.tensors()]
     incoming = (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities)
@@ -67,12 +68,3 @@ def _step(state: AdamState) -> tuple[Any, ...]:
     """A parameter and its moments, the tables of its step, and the betas with epsilon."""
     rates, roots, *rest = round_factors(step_factors(state.learning_rate, None, lr_boost=state.lr_boost))
     return (*(t.detach() for t in state[:3]), rates, roots, rest)
-
-
-def _check_splats(g: SplatGradients) -> None:
-    check_row_shapes(
-        len(g.source),
-        means_px=(g.means_px, 2), conics=(g.conics, 3), colors=(g.colors, 3), opacities=(g.opacities[:, None], 1),
-        color_values=(g.color_values, 3), opacity_values=(g.opacity_values[:, None], 1),
-        **({} if g.depths is None else {"depths": (g.depths[:, None], 1)}),
-    )  # fmt: skip

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.arguments import new_floats
 from vdgs.kernels.kernel_types import PhotometricLoss
@@ -57,7 +58,7 @@ def _measure(
         ssim_weight,
         gradient,
     )
-    loss, l1, ssim = (torch.tensor(value, dtype=torch.float32) for value in values)
+    loss, l1, ssim = (torch.tensor(value, dtype=torch.float32, device="cpu") for value in values)
     return loss, l1, ssim
 
 
@@ -72,7 +73,7 @@ class _Photometric(torch.autograd.Function):
         return loss, l1, ssim
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, scale: Tensor | None, *_: Any) -> Any:
         if scale is None:
             return None, None, None, None

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.autograd import check_splats, rasterize_with_autograd
+from vdgs.kernels.autograd import Drawn, check_picture_gradients, check_splats, rasterize_with_autograd
 from vdgs.kernels.cpu import extension as native_module
 from vdgs.kernels.cpu.arguments import check_outputs, new_floats
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, SplatContributions, Splats
@@ -27,7 +27,12 @@ def rasterize(
     tensors of another dtype, device or shape, or a side outside 1 .. 524272 pixels; RuntimeError for second
     derivatives.
     """
-    return rasterize_with_autograd(lambda tensors: _draw(tensors, width, height, depth, module), splats, background)
+
+    def draw(tensors: tuple[Tensor, ...]) -> Drawn:
+        raster, pullback = _draw(tensors, width, height, depth, module)
+        return Drawn(raster, (), lambda: pullback)
+
+    return rasterize_with_autograd(draw, splats, background)
 
 
 def rasterize_vjp(
@@ -69,7 +74,7 @@ def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, mod
         *(t.detach().contiguous().numpy() for t in tensors[:5]), behind, width, height,
         *(None if t is None else t.numpy() for t in raster),
     )  # fmt: skip
-    return raster, _Pullback(frame, module, len(tensors[0]), behind, depth)
+    return raster, _Pullback(frame, module, len(tensors[0]), behind, depth, (height, width))
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,7 @@ class _Pullback:
     count: int
     background: tuple[float, ...]
     with_depth: bool
+    size: tuple[int, int]
 
     def __call__(
         self,
@@ -90,6 +96,7 @@ class _Pullback:
         out: tuple[Tensor, Tensor] | None = None,
         count: int | None = None,
     ) -> RasterGradients:
+        check_picture_gradients(*self.size, image, alpha, depth)
         n = self.count if count is None else count
         means, conics = out or (new_floats(n, 2), new_floats(n, 3))
         if not 0 <= n <= self.count or not len(means) == len(conics) == n:

@@ -23,7 +23,7 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
     """As `torch_ref.count_visibility`, exactly: float64 decides what float32 cannot. O(n) memory; a block of 512
     neighbors inside or outside a frustum costs one test."""
     check_points(points)
-    count = torch.zeros(points.shape[0], dtype=torch.int32)
+    count = torch.zeros(points.shape[0], dtype=torch.int32, device="cpu")
     if len(cameras) == 0 or points.shape[0] == 0:
         return count
     packed = np.stack([camera.packed_float64 for camera in cameras])
@@ -45,7 +45,7 @@ def fade_factors(
     threads. O(n) memory; a block of 512 neighbors that a camera does not reach costs one test."""
     check_points(points)
     if least <= 0 or len(cameras) < least:
-        return torch.full(points.shape[:1], float(least <= 0), dtype=torch.float32)
+        return torch.full(points.shape[:1], float(least <= 0), dtype=torch.float32, device="cpu")
     packed = np.stack([camera.packed_float64 for camera in cameras])
     factors = new_floats(points.shape[0])
     extension.get_extension().fade_factors(points.detach().contiguous(), packed, least, margin, factors)

@@ -45,8 +45,9 @@ def adam_tensors(
     rates, root, known = [], 1.0, dict[tuple[float, float], float]()
     for state, gradient in zip(states, gradients, strict=True):
         if not _fit(state, gradient):
+            if state.parameter.dtype != torch.float32:
+                raise TypeError(f"parameter must be float32, not {state.parameter.dtype}")
             check_rows(state, None, gradient)
-            raise TypeError(f"parameter must be float32, not {gradient.dtype}")
         rate = state.learning_rate, state.lr_boost
         if rate not in known:  # some tensors share one
             factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.argument_checks import check_anchor_shapes
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
 from vdgs.kernels.kernel_types import (
     FEATURE_SIZE,
@@ -24,6 +25,7 @@ from vdgs.kernels.kernel_types import (
     TrainingSplats,
 )
 from vdgs.kernels.splat_segments import ANCHORS_PER_SEGMENT, SplatMask, SplatSegments
+from vdgs.kernels.torch_ref.adam import check_indices
 from vdgs.kernels.torch_ref.decode import decode as torch_decode
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
@@ -72,7 +74,7 @@ def decode(
     """As `torch_ref.decode`, for float32 tensors on a CUDA device; `torch_ref` itself where autograd follows.
 
     Deterministic. Waits for the device once, for the number of splats, which are then sorted. Raises ValueError for
-    more than 32 offsets, TypeError for other dtypes, CudaUnavailable where the kernel cannot be run.
+    shapes that do not match or k > 32, TypeError for other dtypes, CudaUnavailable where the kernel cannot be run.
     """
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
@@ -124,7 +126,10 @@ def _decoded(
     `whole` the sum of volumes of each segment."""
     positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
+    check_anchor_shapes(*anchors)
     check_decoder(k, weights, anchors)
+    if rows is not None:
+        check_indices(rows, len(positions))
     heads = [tensor for head in pack_decoder(weights, k) for tensor in head]
     count = len(positions) if rows is None else len(rows)
     blocks = -(-count // ANCHORS_PER_BLOCK)
@@ -192,11 +197,17 @@ def _pack(weights: DecoderWeights, k: int) -> list[tuple[Tensor, ...]]:
 
 
 @cache
+def decoder_shapes(k: int, inputs: int) -> tuple[tuple[int, ...], ...]:
+    """Of the twelve tensors of a decoder of anchors with k offsets."""
+    hidden = (HIDDEN_SIZE, inputs), (HIDDEN_SIZE,)
+    return tuple(shape for c in (1, 7, 3) for shape in (*hidden, (c * k, HIDDEN_SIZE), (c * k,)))
+
+
+@cache
 def packing_order(k: int, inputs: int, device: torch.device) -> tuple[Int64[Tensor, " w"], tuple[tuple[int, ...], ...]]:
     """Which number of a decoder's tensors, one after the other, is which number of the packed ones; their shapes."""
-    hidden = (HIDDEN_SIZE, inputs), (HIDDEN_SIZE,)
-    sizes = [size for c in (1, 7, 3) for size in (*hidden, (c * k, HIDDEN_SIZE), (c * k,))]
-    places = torch.arange(sum(map(math.prod, sizes)), dtype=torch.float64).split([*map(math.prod, sizes)])
+    sizes = decoder_shapes(k, inputs)
+    places = torch.arange(sum(map(math.prod, sizes)), dtype=torch.float64, device="cpu").split([*map(math.prod, sizes)])
     named = [part.view(size) for part, size in zip(places, sizes, strict=True)]
     heads = [MlpWeights(*named[first : first + 4]) for first in range(0, len(named), 4)]
     packed = [tensor for head in heads for tensor in pack_head(head, k)]
@@ -212,11 +223,14 @@ def pack_head(head: MlpWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def check_decoder(k: int, weights: DecoderWeights, anchors: Sequence[Tensor]) -> None:
-    """Raise a clear error unless a warp can decode anchors of so many offsets, and all numbers are float32."""
+    """Raise a clear error unless a warp can decode anchors of so many offsets by these weights, and all numbers are
+    float32."""
     inputs = weights.opacity.w1.shape[1]
     if not 1 <= k <= MAX_OFFSETS:
         raise ValueError(f"offsets per anchor must be 1 to {MAX_OFFSETS}, not {k}")
     if inputs not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
         raise ValueError(f"a head's first layer must be 35 or 36 wide, not {inputs}")
+    if tuple(tuple(t.shape) for t in weights.tensors()) != decoder_shapes(k, inputs):
+        raise ValueError(f"a head must be [32, 35 or 36], [32], [outputs, 32], [outputs] for {k} offsets an anchor")
     if any(t.dtype != torch.float32 for t in (*anchors, *weights.tensors())):
         raise TypeError("anchors and decoder must be float32")

@@ -11,11 +11,12 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.argument_checks import check_anchor_shapes, check_splat_gradients
 from vdgs.kernels.cuda.decode import ANCHORS_PER_BLOCK, PROGRAM, check_decoder, pack_decoder
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
 from vdgs.kernels.kernel_types import HIDDEN_SIZE, AdamState, DecoderWeights, IsFinite, SplatGradients
 from vdgs.kernels.splat_segments import SplatMask
-from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_updates
+from vdgs.kernels.torch_ref.adam import bias_correction_tables, check_indices, check_updates
 
 #: Anchors whose contributions to the decoder's gradients are stored at once: whole blocks.
 ANCHORS_PER_CHUNK = 2**16
@@ -41,12 +42,20 @@ def decode_backward_adam(
     TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
     check_updates(updates, len(positions))
+    check_indices(rows, len(positions))
     features, offsets, _ = moved
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
     parts = [getattr(state, name) for name in ("parameter", "first", "second") for state in moved]
+    check_anchor_shapes(positions, *parts[: len(moved)])
     check_decoder(k, weights, (positions, *parts))
+    if any(not state.parameter.shape == state.first.shape == state.second.shape for state in moved):
+        raise ValueError("parameter and moments must be of one shape")
     if len({state.lr_boost for state in moved}) > 1:
         raise ValueError("features, offsets and log-scales must be annealed alike")
+    check_splat_gradients(gradients)
+    incoming = (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities, gradients.depths)
+    if any(t is not None and t.dtype != torch.float32 for t in incoming):
+        raise TypeError("gradients of splats must be float32")
     v, device, source = len(rows), positions.device, gradients.source
     shown = source if isinstance(source, SplatMask) else SplatMask.of(source, v, k)
     lacking, roots = bias_correction_tables(0.9, 0.999, device, torch.float32)
@@ -57,8 +66,7 @@ def decode_backward_adam(
     ]  # fmt: skip
     after: list[KernelArgument] = [
         ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.segments.starts,
-        *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities)),
-        None if gradients.depths is None else gradients.depths.contiguous(),
+        *(None if t is None else t.contiguous() for t in incoming),
         ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())

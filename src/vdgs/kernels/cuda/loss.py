@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.kernel_types import PhotometricLoss
 from vdgs.kernels.torch_ref.loss import check_images
@@ -71,7 +72,7 @@ class _Photometric(torch.autograd.Function):
         return loss, l1, ssim
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, scale: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
         # A product even with 1: to look at the number would wait for the device.
         return None if scale is None else ctx.gradient * scale, None, None, None, None

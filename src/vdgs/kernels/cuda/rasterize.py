@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.autograd import check_splats, rasterize_with_autograd
+from vdgs.kernels.autograd import Drawn, check_picture_gradients, check_splats, rasterize_with_autograd
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
 from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterGradients, RasterPullback, SplatContributions, Splats
 from vdgs.kernels.splat_segments import SplatSegments
@@ -50,7 +51,7 @@ def rasterize_vjp(
     program: CudaProgram = PROGRAM,
 ) -> tuple[Raster, RasterPullback]:
     """`rasterize` without autograd: the image, and its pullback, which reads the splats again."""
-    return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program)
+    return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program).with_pullback()
 
 
 def splat_contributions(
@@ -82,7 +83,7 @@ class _Entries:
 
 def _draw(
     tensors: tuple[Tensor, ...], runs: SplatSegments | None, width: int, height: int, depth: bool, program: CudaProgram
-) -> tuple[Raster, RasterPullback]:
+) -> Drawn:
     """The picture of means_px, conics, colors, opacities, depths before a background, and the way back."""
     check_splats(tensors, width, height)
     *splats, background = (t.detach().contiguous() for t in tensors)
@@ -95,20 +96,15 @@ def _draw(
         "rasterize_forward", grid, (THREADS,), *splats, entries.owners, entries.order, entries.bounds, background,
         ctypes.c_int(width), ctypes.c_int(height), image, transmittance, last, *depths,
     )  # fmt: skip
-    raster = Raster(image, 1.0 - transmittance, *depths)
-    return raster, _Pullback(
-        program=program,
-        splats=splats,
-        background=background,
-        entries=entries,
-        raster=raster,
-        transmittance=transmittance,
-        last=last,
-    )
+    back = partial(
+        _Pullback, program=program, splats=splats, background=background, entries=entries,
+        transmittance=transmittance, last=last,
+    )  # fmt: skip
+    return Drawn(Raster(image, 1.0 - transmittance, *depths), (image, depths[0]), back)
 
 
 def _order(runs: SplatSegments, m: int, program: CudaProgram) -> Int32[Tensor, " m"]:
-    """`Runs.order` in one pass: a warp a run."""
+    """`SplatSegments.order` in one pass: a warp a run."""
     order, count = runs.starts.new_empty(m), len(runs.starts)
     ends = runs.lengths.cumsum(0, dtype=torch.int32)
     program.launch("order_splats", _over(32 * count), (THREADS,), runs.starts, ends, ctypes.c_int(count), order)
@@ -132,15 +128,16 @@ def _entries(splats: list[Tensor], runs: SplatSegments | None, grid: tuple[int, 
     return _Entries(owners, before, torch.searchsorted(ordered, begins), ends, order)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Pullback:
-    """A `RasterPullback` and what it keeps of an image."""
+    """A `RasterPullback` and what it reads."""
 
+    image: Float[Tensor, "h w 3"]
+    depth: Float[Tensor, "h w"] | None
     program: CudaProgram
     splats: list[Tensor]
     background: Tensor
     entries: _Entries
-    raster: Raster
     transmittance: Float[Tensor, "h w"]
     last: Int32[Tensor, "h w"]
 
@@ -154,11 +151,12 @@ class _Pullback:
     ) -> RasterGradients:
         means, conics, colors, opacities, depths = self.splats
         entries, (height, width) = self.entries, self.transmittance.shape
+        check_picture_gradients(height, width, image, alpha, depth)
         wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
         first = slice(count)
         kept = ctypes.c_longlong(len(means[first]))
         sums = means.new_zeros(len(entries.owners), SUMS_PER_ENTRY)
-        picture: list[KernelArgument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
+        picture: list[KernelArgument] = [self.image, self.transmittance, self.last, self.depth]
         self.program.launch(
             "rasterize_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (BACK_THREADS,), *self.splats,
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
@@ -166,7 +164,7 @@ class _Pullback:
         )  # fmt: skip
         by_means, by_conics = out or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
         by_colors, by_opacities = torch.empty_like(colors[first]), torch.empty_like(opacities[first])
-        by_depths = None if self.raster.depth is None else torch.empty_like(depths[first])
+        by_depths = None if self.depth is None else torch.empty_like(depths[first])
         self.program.launch(
             "gather_gradients", _over(len(means)), (THREADS,), *self.splats, entries.splats,
             ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colors, by_opacities,

@@ -4,7 +4,7 @@
 // Every function is a template over the scalar T: `float` for one Gaussian, or a vector of the processor's that
 // brings the operations below with it (native/gaussian.h: sixteen at once). No containers, no exceptions, no
 // standard library beyond scalar functions, so that the same text compiles for a GPU. The torch twins in
-// src/vdgs/kernels/reference are the oracle.
+// src/vdgs/kernels/torch_ref are the oracle.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)

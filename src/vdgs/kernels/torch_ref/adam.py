@@ -167,7 +167,9 @@ def check_rows(state: AdamState, rows: Tensor | None, gradient: Tensor) -> None:
     named = {"parameter": parameter, "first moment": state.first, "second moment": state.second}
     for name, tensor in {**named, "gradient": gradient}.items():
         if not tensor.is_floating_point() or tensor.dtype != parameter.dtype:
-            raise TypeError(f"{name} must be floating and of the parameter's type, not {tensor.dtype}")
+            raise TypeError(
+                f"{name} must be floating and of the parameter's type, {parameter.dtype}, not {tensor.dtype}"
+            )
     for name, tensor in named.items():
         if tensor.ndim == 0 or tensor.shape != parameter.shape:
             raise ValueError(f"{name} is {list(tensor.shape)} but the parameter {list(parameter.shape)}")

@@ -77,7 +77,7 @@ def ssim_map(
 
 def gaussian_window(dtype: torch.dtype = torch.float64) -> Float[Tensor, "taps"]:
     """The separable Gaussian window, of sum 1."""
-    offset = torch.arange(SSIM_WINDOW_PX, dtype=torch.float64) - SSIM_WINDOW_PX // 2
+    offset = torch.arange(SSIM_WINDOW_PX, dtype=torch.float64, device="cpu") - SSIM_WINDOW_PX // 2
     weight = torch.exp(-(offset**2) / (2 * SIGMA_PX**2))
     return (weight / weight.sum()).to(dtype)
 

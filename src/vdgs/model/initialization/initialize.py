@@ -82,7 +82,7 @@ def initialize_anchors(
     if config.from_colors:
         features[:, :3] = _mean_colors(colors, owner.reshape(-1), n) * 2.0 - 1.0
     as_tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
-    offsets = torch.zeros(n, num_offsets, 3, dtype=torch.float32)
+    offsets = torch.zeros(n, num_offsets, 3, dtype=torch.float32, device="cpu")
     log_scales = np.repeat(np.log(spacing)[:, None], 6, axis=1)
     return Anchors(as_tensor(positions), as_tensor(features), offsets, as_tensor(log_scales)), voxel
 

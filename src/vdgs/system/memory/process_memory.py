@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from vdgs.system.memory.cgroups import cgroup_limits, slurm_memory_limit
+from vdgs.system.cgroups import cgroup_limits, slurm_memory_limit
 
 #: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
 OUT_OF_MEMORY_MESSAGES = (

@@ -1,4 +1,4 @@
-// L1 and SSIM with their gradient on a GPU. Definition: reference/loss.py; derivatives: native/cpu/loss.cpp.
+// L1 and SSIM with their gradient on a GPU. Definition: torch_ref/loss.py; derivatives: native/cpu/loss.cpp.
 //
 // Three kernels. A block of 16x16 threads does one tile of the image, channel after channel: it reads the tile with a
 // margin of half a window into shared memory, blurs it along the rows and then, one pixel a thread, down the columns.
@@ -23,7 +23,7 @@ constexpr int kSlopes = 3;
 constexpr float kC1 = 0.01f * 0.01f;
 constexpr float kC2 = 0.03f * 0.03f;
 
-// A Gaussian of standard deviation 1.5 pixels with sum 1; a test compares it with reference.loss.window().
+// A Gaussian of standard deviation 1.5 pixels with sum 1; a test compares it with torch_ref.loss.gaussian_window().
 __constant__ const float kWindow[kTaps] = {
     0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f, 0.213005543f, 0.266011715f,
     0.213005543f, 0.109360687f, 0.0360007733f, 0.00759875821f, 0.00102838012f};

@@ -1,6 +1,6 @@
 // Cells of space: keys, groups of equal keys, membership by hash, order along a Morton curve.
 //
-// The meaning is that of reference/cells.py. Keys are computed in float64 with the same operations in the same
+// The meaning is that of torch_ref/cells.py. Keys are computed in float64 with the same operations in the same
 // order as there, so that both agree on every position.
 #include <algorithm>
 #include <atomic>

@@ -15,7 +15,7 @@
 //
 // the gradient of sum S is  G(S_a) + 2x G(S_q) + y G(S_c): zero padding makes G its own adjoint.
 //
-// Where the mask is zero x is replaced by y and neither sum counts the pixel: see reference/loss.py.
+// Where the mask is zero x is replaced by y and neither sum counts the pixel: see torch_ref/loss.py.
 // Tiles do not depend on the number of threads, and their sums are added in order: same bits always.
 #include <algorithm>
 #include <cmath>

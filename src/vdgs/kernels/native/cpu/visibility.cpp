@@ -65,7 +65,7 @@ Frustum frustum_of(const ViewCamera& c) {
            plane_of(c, 0, -c.fy, (c.height - c.cy) * depth, (c.height - c.cy) * flat)}};
 }
 
-// The definition, as cameras.Camera.sees has it.
+// The definition, as geometry.camera.Camera.in_frustum has it.
 bool sees(const ViewCamera& c, const double* p) {
   double local[3];
   for (int i = 0; i < 3; ++i) {

@@ -124,7 +124,6 @@ VDGS_INLINE I16 to_int(F16 a) { return {_mm512_cvttps_epi32(a.v)}; }
 VDGS_INLINE F16 to_float(I16 a) { return {_mm512_cvtepi32_ps(a.v)}; }
 VDGS_INLINE I16 bits_of(F16 a) { return {_mm512_castps_si512(a.v)}; }
 VDGS_INLINE F16 float_of_bits(I16 a) { return {_mm512_castsi512_ps(a.v)}; }
-VDGS_INLINE F16 gather(const float* base, I16 index) { return {_mm512_i32gather_ps(index.v, base, 4)}; }
 
 namespace shuffles {
 // Which of 32 lanes (first register: 0..15, second: 16..31) each lane of the result takes.

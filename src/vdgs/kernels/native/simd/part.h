@@ -24,7 +24,6 @@ namespace part {
 VDGS_INLINE FloatPart min(FloatPart a, FloatPart b) { return _mm256_min_ps(a, b); }
 VDGS_INLINE FloatPart max(FloatPart a, FloatPart b) { return _mm256_max_ps(a, b); }
 VDGS_INLINE FloatPart sqrt(FloatPart a) { return _mm256_sqrt_ps(a); }
-VDGS_INLINE FloatPart reciprocal_estimate(FloatPart a) { return _mm256_rcp_ps(a); }
 VDGS_INLINE FloatPart select(IntPart m, FloatPart a, FloatPart b) {
   return _mm256_blendv_ps(b, a, (__m256)m);
 }
@@ -38,7 +37,6 @@ VDGS_INLINE FloatPart select(IntPart m, FloatPart a, FloatPart b) {
 VDGS_INLINE FloatPart min(FloatPart a, FloatPart b) { return _mm_min_ps(a, b); }
 VDGS_INLINE FloatPart max(FloatPart a, FloatPart b) { return _mm_max_ps(a, b); }
 VDGS_INLINE FloatPart sqrt(FloatPart a) { return _mm_sqrt_ps(a); }
-VDGS_INLINE FloatPart reciprocal_estimate(FloatPart a) { return _mm_rcp_ps(a); }
 VDGS_INLINE unsigned bits(IntPart m) { return static_cast<unsigned>(_mm_movemask_ps((__m128)m)); }
 VDGS_INLINE IntPart truncate(FloatPart a) { return (IntPart)_mm_cvttps_epi32(a); }
 #else

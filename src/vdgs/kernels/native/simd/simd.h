@@ -44,7 +44,6 @@ constexpr int kLanes = 16;
 //   exp2_bounded(a)                        the same, faster, for -126 < a < 127 (elsewhere: any value)
 //   to_int(a) (truncates), to_float(i), bits_of(a), float_of_bits(i)
 //   I16: + - & | shift_left<n> shift_right<n> (logical) load store loadu storeu lt
-//   gather(base, index)                    base[index[lane]]
 //   load2/load3(p, x, y, ..), store3(..)   rows of two or three floats, to and from columns
 //   compress_store(p, m, a)                the chosen lanes, packed; writes no more than those
 //   load_quads(p, stride), store_quads     lanes 4i .. 4i+3 at p + i stride
@@ -82,25 +81,5 @@ VDGS_INLINE F16 log(F16 a) { return log2(a) * splat(0.693147180559945309f); }
 VDGS_INLINE F16 sigmoid(F16 a) { return exact_reciprocal(splat(1.0f) + exp(splat(0.0f) - a)); }
 
 VDGS_INLINE F16 clamp(F16 a, float low, float high) { return min(max(a, splat(low)), splat(high)); }
-
-// p[0], p[stride], p[2 stride], ...
-VDGS_INLINE F16 load_strided(const float* p, ptrdiff_t stride) {
-  alignas(64) float lanes[kLanes];
-  for (int i = 0; i < kLanes; ++i) lanes[i] = p[i * stride];
-  return load(lanes);
-}
-
-VDGS_INLINE void store_strided(float* p, ptrdiff_t stride, F16 a) {
-  alignas(64) float lanes[kLanes];
-  store(lanes, a);
-  for (int i = 0; i < kLanes; ++i) p[i * stride] = lanes[i];
-}
-
-// One lane as a scalar; for tests and rare paths.
-VDGS_INLINE float lane(F16 a, int i) {
-  alignas(64) float lanes[kLanes];
-  store(lanes, a);
-  return lanes[i];
-}
 
 }  // namespace vdgs

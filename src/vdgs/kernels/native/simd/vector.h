@@ -196,11 +196,6 @@ VDGS_INLINE F16 float_of_bits(I16 a) {
   VDGS_EACH r.v[k] = (FloatPart)a.v[k];
   return r;
 }
-VDGS_INLINE F16 gather(const float* base, I16 index) {
-  F16 r;
-  VDGS_EACH for (int i = 0; i < kPartLanes; ++i) r.v[k][i] = base[index.v[k][i]];
-  return r;
-}
 
 VDGS_INLINE F16 floor(F16 a) {
 #if defined(__AVX2__)
@@ -214,16 +209,8 @@ VDGS_INLINE F16 floor(F16 a) {
 #endif
 }
 
-VDGS_INLINE F16 reciprocal(F16 a) {
-#if defined(__SSE2__)
-  // The 12-bit estimate of the processor, refined by one Newton step: 23 bits.
-  F16 estimate;
-  VDGS_EACH estimate.v[k] = part::reciprocal_estimate(a.v[k]);
-  return fma(estimate, fnma(a, estimate, splat(1.0f)), estimate);
-#else
-  return splat(1.0f) / a;
-#endif
-}
+// Divided: the bits of the processor's estimate (rcpps) differ from maker to maker.
+VDGS_INLINE F16 reciprocal(F16 a) { return splat(1.0f) / a; }
 VDGS_INLINE F16 rsqrt(F16 a) { return splat(1.0f) / sqrt(a); }
 
 VDGS_INLINE float hsum(F16 a) {

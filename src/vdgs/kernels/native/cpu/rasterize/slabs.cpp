@@ -20,10 +20,11 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 // memory traffic per slab.
 constexpr double kFirstSlabPerTile = 400, kSlabGrowth = 1.6;
 
-// The bits of a float in the order of its value (negative ones flipped).
+// The bits of a float in the order of its value (negative ones flipped; -0 is 0).
 uint32_t key_of_depth(float depth) {
   uint32_t u;
   std::memcpy(&u, &depth, 4);
+  if ((u << 1) == 0) u = 0;
   return u ^ (static_cast<uint32_t>(-static_cast<int32_t>(u >> 31)) | 0x80000000u);
 }
 

@@ -1,4 +1,5 @@
-"""torch's default dtype, which pose graphs and calibrations set to float64, changes no bit of any result."""
+"""torch's default dtype, which pose graphs and calibrations set to float64, changes no bit of any result; nor does its
+default device, which programs for gsplat set to their card."""
 
 from __future__ import annotations
 
@@ -21,16 +22,24 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 
 PACKAGE = Path(vdgs.__file__).parent
-#: What torch makes in its default dtype unless it is told another.
+#: What torch makes in its default dtype unless it is told another, and what also on its default device.
 MAKERS = {"empty", "eye", "full", "linspace", "ones", "rand", "randn", "tensor", "zeros"}
+MAKERS_ON_A_DEVICE = MAKERS | {
+    "arange", "as_tensor", "asarray", "logspace", "randint", "randperm", "scalar_tensor", "tril_indices",
+    "triu_indices",
+}  # fmt: skip
 CAMERA = camera_at(0.0, 0.0)
 
 
-@pytest.fixture
-def double():
-    """float64 as the default, from the call on."""
-    yield lambda: torch.set_default_dtype(torch.float64)
-    torch.set_default_dtype(torch.float32)
+@pytest.fixture(params=["float64", "another device"])
+def other_defaults(request):
+    """float64, or a device that is not the CPU (and has no numbers), as the default, from the call on."""
+    if request.param == "float64":
+        yield lambda: torch.set_default_dtype(torch.float64)
+        torch.set_default_dtype(torch.float32)
+    else:
+        yield lambda: torch.set_default_device("meta")
+        torch.set_default_device(None)
 
 
 def floats(*shape: int, low: float = -1.0, high: float = 1.0) -> torch.Tensor:
@@ -51,15 +60,15 @@ def rasterization(packed: bool, poses: bool = False, **options):
     given["viewmats"] = torch.from_numpy(CAMERA.camera_from_world.astype(np.float32))[None]
     moved = [each.requires_grad_() for name, each in given.items() if poses or name != "viewmats"]
     picture, alpha, meta = ops.rasterization(
-        **given, Ks=torch.tensor([K], dtype=torch.float32), width=CAMERA.width, height=CAMERA.height, packed=packed,
-        **options,
+        **given, Ks=torch.tensor([K], dtype=torch.float32, device="cpu"), width=CAMERA.width, height=CAMERA.height,
+        packed=packed, **options,
     )  # fmt: skip
     gradients = torch.autograd.grad((picture.square().sum() + alpha.sum()), moved)
     return picture, alpha, *gradients, *(meta[name] for name in sorted(meta))
 
 
 def splats(n: int = 50) -> Splats:
-    conics = torch.tensor([[0.1, 0.01, 0.2]], dtype=torch.float32).repeat(n, 1)
+    conics = torch.tensor([[0.1, 0.01, 0.2]], dtype=torch.float32, device="cpu").repeat(n, 1)
     depths, opacities = floats(n, low=1.0, high=2.0), floats(n, low=0.2, high=0.9)
     return Splats(floats(n, 2, low=0.0, high=30.0), conics, depths, floats(n, 3), opacities)
 
@@ -72,7 +81,8 @@ def loss():
 
 
 def loss_vjp():
-    found, gradient = cpu.photometric_loss_vjp(floats(20, 30, 3, low=0.0), torch.zeros(20, 30, 3, dtype=torch.uint8))
+    target = torch.zeros(20, 30, 3, dtype=torch.uint8, device="cpu")
+    found, gradient = cpu.photometric_loss_vjp(floats(20, 30, 3, low=0.0), target)
     return *found, gradient
 
 
@@ -101,10 +111,8 @@ def drawn():
 
 def statistics():
     sums = DensificationStats.zeros(4, 3)
-    visible, inside = torch.tensor([0, 2], dtype=torch.int64), torch.tensor([True, True])
-    cpu.add_view_statistics(
-        sums, visible, inside, torch.tensor([0, 4], dtype=torch.int32), floats(2, low=0.1), floats(2, 2), 8, 8
-    )
+    visible, source = STARTS - STARTS.new_tensor([0, 1]), STARTS.new_tensor([0, 4], dtype=torch.int32)
+    cpu.add_view_statistics(sums, visible, visible >= 0, source, floats(2, low=0.1), floats(2, 2), 8, 8)
     return tuple(sums.tensors().values())
 
 
@@ -137,43 +145,46 @@ RESULTS = {
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_results_are_the_same_to_the_last_bit(name, double):
+def test_results_are_the_same_to_the_last_bit(name, other_defaults):
     wanted = RESULTS[name]()
-    double()
+    other_defaults()
     for found, expected in zip(RESULTS[name](), wanted, strict=True):
         if isinstance(expected, torch.Tensor):
-            assert found.dtype == expected.dtype
+            assert (found.dtype, found.device) == (expected.dtype, expected.device)
             assert found.detach().numpy().tobytes() == expected.detach().numpy().tobytes()
             assert expected.numel() > 0
         else:
             assert found == expected
 
 
-def test_so_are_gradients_of_a_picture_drawn_before(double):
+def test_so_are_gradients_of_a_picture_drawn_before(other_defaults):
     given = splats()
     moved = given.colors.requires_grad_(True)
     raster = cpu.rasterize(given, floats(3), 30, 20)
     (wanted,) = torch.autograd.grad(raster.image.square().sum(), moved, retain_graph=True)
-    double()
+    other_defaults()
     assert torch.equal(torch.autograd.grad(raster.image.square().sum(), moved)[0], wanted)
 
 
-def test_so_is_a_trained_model(double):
-    wanted = bits(run(start(), stage()))
-    double()
-    assert bits(run(start(), stage())) == wanted
+def test_so_is_a_trained_model(other_defaults):
+    wanted, again = bits(run(start(), stage())), (start(), stage())
+    other_defaults()
+    assert bits(run(*again)) == wanted
 
 
-def test_no_file_leaves_the_dtype_to_torch():
-    """Of what a kernel fills, its binding would convert a float64 one into a copy and lose what it wrote."""
+def test_no_file_leaves_the_dtype_or_the_device_to_torch():
+    """Of what a kernel fills, its binding would convert a float64 one into a copy and lose what it wrote, and not know
+    one on another device."""
     found = []
     for file in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
                 continue
-            if ast.unparse(node.func.value) == "torch" and node.func.attr in MAKERS:
-                named = any(word.arg == "dtype" for word in node.keywords)
-                found += [] if named else [f"{file.relative_to(PACKAGE)}:{node.lineno} {ast.unparse(node)}"]
+            if ast.unparse(node.func.value) != "torch" or node.func.attr not in MAKERS_ON_A_DEVICE:
+                continue
+            wanted = {"device"} | ({"dtype"} if node.func.attr in MAKERS else set())
+            if not wanted <= {word.arg for word in node.keywords}:
+                found.append(f"{file.relative_to(PACKAGE)}:{node.lineno} {ast.unparse(node)}")
     assert found == []
 
 

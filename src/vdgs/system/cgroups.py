@@ -1,5 +1,5 @@
-"""Memory limits of Linux control groups (containers, SLURM jobs, systemd units). Standard library only, for `vdgs
-doctor`."""
+"""Limits of memory and processors of Linux control groups (containers, SLURM jobs, systemd units). Standard library
+only, for `vdgs doctor`."""
 
 from __future__ import annotations
 
@@ -29,10 +29,14 @@ class CgroupLimit:
 def cgroup_limits(process: Path = PROC_SELF) -> list[CgroupLimit]:
     """The limits of this process's control group and of all above it (versions 1 and 2); [] where none is set. Groups
     that are not visible (above a container's root, not mounted) are left out."""
-    with suppress(OSError, ValueError):  # no Linux
-        groups = _groups(_own_groups((process / "cgroup").read_text()), (process / "mountinfo").read_text())
-        return [limit for folder, version in groups if (limit := _limit(folder, version)) is not None]
-    return []
+    return [limit for folder, version in _groups("memory", process) if (limit := _limit(folder, version)) is not None]
+
+
+def cgroup_cpus(process: Path = PROC_SELF) -> float | None:
+    """How many processors this process's control group and all above it leave it at most, by their quotas of time
+    (`docker run --cpus=1.5`); None where none is set."""
+    quotas = [quota for folder, version in _groups("cpu", process) if (quota := _quota(folder, version)) is not None]
+    return min(quotas, default=None)
 
 
 def slurm_memory_limit(environment: Mapping[str, str] = os.environ) -> int | None:
@@ -50,24 +54,32 @@ def slurm_memory_limit(environment: Mapping[str, str] = os.environ) -> int | Non
     return mib << 20 or None
 
 
-def _own_groups(text: str) -> dict[int, str]:
-    """This process's group in the hierarchy that may limit memory, by version, as /proc/self/cgroup names it."""
+def _groups(controller: str, process: Path) -> list[tuple[Path, int]]:
+    """The folders of this process's groups in the hierarchies of a controller, from its own up to where the hierarchy
+    is mounted, and their version."""
+    with suppress(OSError, ValueError):  # no Linux
+        own = _own_groups(controller, (process / "cgroup").read_text())
+        return list(_visible_groups(controller, own, (process / "mountinfo").read_text()))
+    return []
+
+
+def _own_groups(controller: str, text: str) -> dict[int, str]:
+    """This process's group in the hierarchy that may limit it, by version, as /proc/self/cgroup names it."""
     own = dict[int, str]()
     for line in text.splitlines():
         number, controllers, path = line.split(":", 2)
-        if "memory" in controllers.split(","):
+        if controller in controllers.split(","):
             own[1] = path
         elif number == "0" and not controllers:
             own[2] = path
     return own
 
 
-def _groups(own: Mapping[int, str], mounts: str) -> Iterator[tuple[Path, int]]:
-    """The folders of this process's groups, from its own up to where the hierarchy is mounted, and their version."""
+def _visible_groups(controller: str, own: Mapping[int, str], mounts: str) -> Iterator[tuple[Path, int]]:
     for line in mounts.splitlines():
         before, _, after = line.partition(" - ")
         kind, _, options = after.split(" ", 2)
-        version = 2 if kind == "cgroup2" else 1 if kind == "cgroup" and "memory" in options.split(",") else 0
+        version = 2 if kind == "cgroup2" else 1 if kind == "cgroup" and controller in options.split(",") else 0
         if version not in own:
             continue
         root, mounted = (_unescaped(field) for field in before.split(" ")[3:5])
@@ -94,4 +106,16 @@ def _limit(folder: Path, version: int) -> CgroupLimit | None:
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
             used -= int(stat[droppable])
         return CgroupLimit(limit, max(0, used))
+    return None
+
+
+def _quota(folder: Path, version: int) -> float | None:
+    """The processors that one group may keep busy; None where it may all."""
+    with suppress(OSError, ValueError):  # no such file (a root has no quota); "max"
+        if version == 2:
+            quota, period = map(int, (folder / "cpu.max").read_text().split())
+        else:
+            quota, period = (int((folder / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period"))
+        if quota > 0 and period > 0:  # version 1 says -1 for all
+            return quota / period
     return None
