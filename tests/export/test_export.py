@@ -67,8 +67,9 @@ def export(tmp_path: Path):
             warning="",
             capture=capture_at(origin),
         )
+        paths = {name: tmp_path / name for name in names}
         request = ExportRequest(
-            run=tmp_path / "run", output=tuple(tmp_path / name for name in names), evaluate=False, device="cpu",
+            run=tmp_path / "run", output=tuple(paths[name] for name in names), evaluate=False, device="cpu",
             color_iterations=color_iterations, **asked,
         )  # fmt: skip
         return export_run(opened, resolve_request(request), QUIET)

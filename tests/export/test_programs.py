@@ -28,6 +28,7 @@ from vdgs.export.formats.gaussian_ply import short_name
 from vdgs.export.programs import FREE, PROGRAMS, axes_for, with_files
 from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians
+from vdgs.system.atomic_files import host_mark, process_mark
 from vdgs.system.scratch import QUIET_SECONDS, remove_leftovers, scratch_folder
 
 pytestmark = pytest.mark.slow
@@ -347,16 +348,9 @@ def test_what_a_killed_export_left_goes_with_the_next(tmp_path, name: str):
     assert done.returncode == -9, done.stderr
     left = listed(tmp_path)
     assert left > mine
-    forget_for_long(tmp_path)
     found = registry.format_from_path(tmp_path / name).tidy(tmp_path / name)
     assert found
     assert listed(tmp_path) == mine
-
-
-def forget_for_long(folder: Path) -> None:
-    """Let all temporary files be old: none is of a process on another machine."""
-    for each in folder.rglob(".*.tmp"):
-        os.utime(each, (time.time() - 2 * QUIET_SECONDS,) * 2)
 
 
 def listed(folder: Path) -> set[str]:
@@ -365,7 +359,7 @@ def listed(folder: Path) -> set[str]:
 
 def test_what_a_living_process_needs_stays(tmp_path):
     path = tmp_path / "a.ply"
-    alive = tmp_path / f".a.ply.{os.getpid()}.tmp"
+    alive = tmp_path / f".a.ply.{process_mark()}.tmp"
     alive.write_text("half")
     with scratch_folder(path) as folder:
         assert remove_leftovers(path) == []
@@ -376,12 +370,13 @@ def test_what_a_living_process_needs_stays(tmp_path):
         os.utime(young, (time.time() - 1000,) * 2)
         assert remove_leftovers(path) == [young]
     assert listed(tmp_path) == {alive.name}
-    other = tmp_path / ".b.ply.999999999.tmp"
-    other.write_text("of another file")
+    gone, elsewhere = (tmp_path / f".b.ply.{mark}-999999999.tmp" for mark in (host_mark(), "0" * 6))
+    for each in (gone, elsewhere):
+        each.write_text("of another file")
     assert remove_leftovers(path) == []
-    assert remove_leftovers(tmp_path / "b.ply") == []  # a process of another machine may write it
-    forget_for_long(tmp_path)
-    assert remove_leftovers(tmp_path / "b.ply") == [other]
+    assert remove_leftovers(tmp_path / "b.ply") == [gone]  # a process of another machine may write the other
+    os.utime(elsewhere, (time.time() - 2 * QUIET_SECONDS,) * 2)
+    assert remove_leftovers(tmp_path / "b.ply") == [elsewhere]
 
 
 def test_the_facts_beside_a_file_say_how_it_stands(tmp_path):

@@ -29,6 +29,7 @@ from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
 from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save_run_cameras
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.visibility_store import get_run_visibility
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
@@ -116,9 +117,18 @@ def test_files_in_a_capture_that_moved_moved_with_it(listed, redo):
     assert run.coarse.is_done(run.keys().coarse)
 
 
-def test_a_command_that_names_the_capture_alone_finds_its_files(listed):
+@pytest.mark.parametrize("original", ["gone", "there"])
+def test_a_command_that_names_the_capture_alone_finds_its_files(listed, original):
+    if original == "there":
+        shutil.copytree(listed / "moved", listed / "place")
     given = {"output": listed / "run", "capture": listed / "moved"}
     assert start_settings(given).options.test_list == listed / "moved" / "mine.txt"
+
+
+def test_folders_in_a_capture_that_are_named_whole_move_with_it():
+    named = CaptureOptions(images="/a/place/images_4", masks="masks", gps=Path("/a/places/gps.csv"))
+    moved = RunSettings.create("/a/place", named, METHOD).moved(Path("/b/place")).capture
+    assert (moved.images, moved.masks, moved.gps) == ("/b/place/images_4", "masks", Path("/a/places/gps.csv"))
 
 
 def test_what_needs_the_capture_says_how_to_name_it(folder):

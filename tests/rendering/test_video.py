@@ -14,6 +14,7 @@ import pytest
 from vdgs.errors import VdgsError
 from vdgs.rendering import video
 from vdgs.rendering.video import Encoder, VideoWriter, caution, check_film, default_encoder
+from vdgs.system.atomic_files import host_mark, process_mark
 
 
 def test_a_film_holds_its_frames(tmp_path: Path):
@@ -166,10 +167,9 @@ def film_of_noise(file: Path, frames: int, encoder: Encoder) -> None:
 
 
 def test_what_a_killed_film_left_goes(tmp_path: Path):
-    left = tmp_path / ".film.mp4.999999999.partial.mp4"
+    left = tmp_path / f".film.mp4.{host_mark()}-999999999.partial.mp4"
     left.write_bytes(b"half")
-    os.utime(left, (0, 0))
-    mine = tmp_path / f".film.mp4.{os.getpid()}.partial.png"
+    mine = tmp_path / f".film.mp4.{process_mark()}.partial.png"
     mine.write_bytes(b"mine")
     with VideoWriter(tmp_path / "film.mp4", 30.0, "mpeg4") as film:
         film.write(np.zeros((8, 8, 3), np.uint8))

@@ -53,13 +53,14 @@ def start_settings(given: GivenArguments) -> StartSettings:
 
 
 def _own_settings(output: Path | None, capture: Path | None) -> Any:
-    """The settings of the run in a folder (`RunSettings`), whose capture may have moved; None where there is none."""
+    """The settings of the run in a folder (`RunSettings`), for its capture where it is given; None where there is no
+    run."""
     if output is None or not (output / "config.yaml").is_file():
         return None
     from vdgs.runs.run_folder import RunFolder
 
     own = RunFolder(output).settings()
-    return own if capture is None or Path(own.capture_path).exists() else own.moved(capture.resolve())
+    return own if capture is None else own.moved(capture.resolve())
 
 
 def _device_of_new_run(device: str) -> str:

@@ -286,11 +286,11 @@ def _all_outputs(asked: ExportRequest) -> list[Path]:
 
 def _check_written_once(paths: Sequence[Path]) -> None:
     """Raise VdgsError where one file, by whichever name, is written for two outputs."""
-    writers = dict[str, Path]()
-    for path in paths:
+    writers = dict[str, int]()
+    for number, path in enumerate(paths):
         for file in registry.format_from_path(path).names(path):
-            other = writers.setdefault(os.path.realpath(file), path)
-            if other is path:
+            other = paths[first := writers.setdefault(os.path.realpath(file), number)]
+            if first == number:
                 continue
             if file.name == path.name == other.name:
                 raise VdgsError(f"--output {path}: is given twice.")

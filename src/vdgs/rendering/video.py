@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vdgs.errors import VdgsError
-from vdgs.system.atomic_files import is_disk_full
+from vdgs.system.atomic_files import is_disk_full, process_mark
 from vdgs.system.scratch import check_takes_files, remove_leftovers
 
 Encoder = Literal["ffmpeg", "av", "vp9", "mpeg4"]
@@ -220,7 +220,7 @@ class VideoWriter:
         if path.suffix.lower() != ".mp4":
             raise VdgsError(f"{path}: films are written as MP4; give a name that ends in .mp4.")
         self.path, self.fps, self.encoder = path, fps, encoder or default_encoder()
-        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial.mp4")
+        self._partial = path.with_name(f".{path.name}.{process_mark()}.partial.mp4")
         self._shape: tuple[int, ...] | None = None
         self._frames = 0
         self._pen: _Pen | None = None

@@ -21,7 +21,7 @@ from vdgs.system.quoting import shell_word
 def has_motion_record(run: RunFolder) -> bool:
     """Whether what moves was looked for with the coarse model that is there, and the masks are complete."""
     record = read_json_or_empty(run.motion_file)
-    if record.get("key") != run.keys().visibility:
+    if record.get("key") != run.keys().visibility or "enough" not in record:
         return False
     masks = [each["mask"] for each in record.get("photographs", ()) if each["mask"] is not None]
     is_enough = bool(record.get("masked")) or run.settings().block.mask_moving == "auto"

@@ -53,9 +53,9 @@ class RunSettings:
         """The settings for the same capture at another place, where the files lie too that options name inside it."""
         before = Path(self.capture_path)
         inside: dict[str, Any] = {
-            name: to / path.relative_to(before)
-            for name, path in vars(self.capture).items()
-            if isinstance(path, Path) and path.is_relative_to(before)
+            name: type(value)(to / Path(value).relative_to(before))
+            for name, value in vars(self.capture).items()
+            if isinstance(value, str | Path) and Path(value).is_relative_to(before)
         }
         return replace(self, capture_path=str(to), capture=replace(self.capture, **inside))
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
+import platform
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -24,10 +26,20 @@ if TYPE_CHECKING:
 FULL_DISK_BYTES = 1 << 20
 
 
+def process_mark() -> str:
+    """What the names of temporary files carry of the process that writes them: a mark of its machine, and its number
+    there."""
+    return f"{host_mark()}-{os.getpid()}"
+
+
+def host_mark() -> str:
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+
+
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it over `path`. Raises VdgsError, with file and
     remedy, when the disk refuses (full, read-only, ...); `path` is then untouched."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{process_mark()}.tmp")
     try:
         with explain_disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,7 @@
 """Folders and files that stand beside an output while it is written, and what killed processes leave of them.
 
-A scratch folder holds a locked file as long as its process lives, on whichever machine. Temporary files carry the
-number of their process (`write_atomic`), which says nothing on another machine of the same disk: one that was written
-to of late stays.
+A scratch folder holds a locked file as long as its process lives, on whichever machine. Temporary files carry a mark of
+their machine and the number of their process (`atomic_files.process_mark`): those of another machine stay for a while.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from pathlib import Path
 
 import psutil
 
-from vdgs.system.atomic_files import explain_disk_errors
+from vdgs.system.atomic_files import explain_disk_errors, host_mark
 
 #: How the names of scratch folders end, and their file that is locked.
 ENDING, LOCK = ".scratch", ".lock"
 #: Temporary files of `write_atomic` and of films.
-_TEMPORARY = re.compile(r"(?:^|\.)([0-9]+)\.(?:tmp|partial\.mp4)$")
+_TEMPORARY = re.compile(r"(?:^|\.)([0-9a-f]{6})-([0-9]+)\.(?:tmp|partial\.mp4)$")
 #: A scratch folder without its file may just be made, for so many seconds.
 _YOUNG_SECONDS = 60.0
-#: A temporary file to which nothing came for so many seconds is not written to on another machine either (choice).
+#: A temporary file of another machine to which nothing came for so many seconds is not written to any more (choice).
 QUIET_SECONDS = 600.0
 
 
@@ -67,7 +66,9 @@ def _is_left(entry: Path, rest: str) -> bool:
     if rest.endswith(ENDING) and entry.is_dir() and not entry.is_symlink():
         return not _is_held(entry)
     found = _TEMPORARY.search(rest)
-    return found is not None and entry.is_file() and not psutil.pid_exists(int(found[1])) and _is_quiet(entry)
+    if found is None or not entry.is_file():
+        return False
+    return not psutil.pid_exists(int(found[2])) if found[1] == host_mark() else _is_quiet(entry)
 
 
 def _is_quiet(file: Path) -> bool:
