@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import sys
 import time
 import typing
 from collections.abc import Iterator, Mapping
@@ -54,6 +53,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_keys import hashable_settings
 from vdgs.synth import SynthOptions, generate
 from vdgs.system.atomic_files import read_json, to_jsonable, write_json, write_text
+from vdgs.system.child_python import python_command
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _train(
         stem = settings.output / "jobs" / run.name.replace("/", "__")
         job.write(stem.with_name(stem.name + ".json"))
         after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
-        command = [sys.executable, "-m", "experiments.bench.worker", str(stem.with_name(stem.name + ".json"))]
+        command = python_command("experiments.bench.worker", stem.with_name(stem.name + ".json"))
         output = stem.with_name(stem.name + ".log")
         tasks.append(Task(name=run.name, command=command, output=output, environment=_environment(), after=after))
     if done:

@@ -15,7 +15,6 @@ import hashlib
 import itertools
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -38,6 +37,7 @@ from vdgs.kernels import get_num_threads
 from vdgs.kernels.device_selection import AnyCard, cards_left_out, cards_of
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import write_json
+from vdgs.system.child_python import python_command
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.process_memory import available_memory_bytes
 
@@ -212,10 +212,10 @@ class ShardedJob:
     def _command(self, index: int, allocation: Allocation, device: str) -> list[str]:
         # A GPU that a shard is given is not this machine's.
         device = "auto" if allocation.resources.gpus and device == "cpu" else device
-        return [
-            sys.executable, "-m", "vdgs.distributed.run_shard", str(self.folder), str(index), "--threads",
-            str(allocation.resources.cpus), "--image-cache-gb", f"{allocation.image_gb:.3f}", "--device", device,
-        ]  # fmt: skip
+        return python_command(
+            "vdgs.distributed.run_shard", self.folder, index, "--threads", allocation.resources.cpus,
+            "--image-cache-gb", f"{allocation.image_gb:.3f}", "--device", device,
+        )  # fmt: skip
 
     def _raise_unless_done(self, results: Sequence[TaskResult], total: int) -> None:
         kind = self.kind
