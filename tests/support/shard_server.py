@@ -62,7 +62,11 @@ def fork_shard_where_asked() -> None:
         return
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
         server.connect(os.environ[VARIABLE])
-        order = {"arguments": sys.orig_argv[sys.orig_argv.index(MODULE) + 1 :], "folder": os.getcwd(), "environment": dict(os.environ)}
+        order = {
+            "arguments": sys.orig_argv[sys.orig_argv.index(MODULE) + 1 :],
+            "folder": os.getcwd(),
+            "environment": dict(os.environ),
+        }
         socket.send_fds(
             server,
             [json.dumps(order | {"started": os.getpid()}, ensure_ascii=False).encode(errors="surrogateescape")],
