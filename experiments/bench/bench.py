@@ -46,6 +46,7 @@ from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.distributed.executor import LogListener, Task, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.progress_table import STATE_STYLES
+from vdgs.distributed.scheduler import stop_message
 from vdgs.errors import Stopped, VdgsError
 from vdgs.evaluation.lpips import check_weights_file
 from vdgs.kernels import default_num_threads
@@ -92,7 +93,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
         settings = replace(settings, plan_options=options)
         results, outcomes = _run_plan(make_plan(settings.table, options), settings, console)
     if any(each.state == "stopped" for each in outcomes.values()):
-        raise Stopped("Stopped; every run is saved. The same command continues.")
+        raise Stopped(stop_message(outcomes.values(), "every run"))
     errors = [each for each in outcomes.values() if each.state == "failed"]
     if errors:
         raise VdgsError(

@@ -31,6 +31,7 @@ from vdgs.distributed.job_folders import SHARDS, clear, remove
 from vdgs.distributed.job_labels import JobLabels
 from vdgs.distributed.node_check import NodeRequirements, code_digest
 from vdgs.distributed.resource_allocation import Allocation, MachineResources, ShardWorkload
+from vdgs.distributed.scheduler import stop_message
 from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.errors import RunError, Stopped
 from vdgs.kernels import get_num_threads
@@ -165,8 +166,9 @@ class ShardedJob:
         """Do these shards of a `total`. `on_ready` is called once machines are known to be fit, before anything starts;
         by default it marks the shards as queued.
 
-        Raises RunError if a shard failed (the others are done first), Stopped after Ctrl-C or SIGTERM (each saved), and
-        VdgsError where a machine of a cluster cannot do the work, before anything starts.
+        Raises RunError if a shard failed (the others are done first), Stopped after Ctrl-C or SIGTERM (each saved, but
+        for those that a second Ctrl-C kills), and VdgsError where a machine of a cluster cannot do the work, before
+        anything starts.
         """
         kind = self.kind
         workload = ShardWorkload(
@@ -220,9 +222,7 @@ class ShardedJob:
     def _raise_unless_done(self, results: Sequence[TaskResult], total: int) -> None:
         kind = self.kind
         if any(result.state == "stopped" for result in results):
-            raise Stopped(
-                f"Stopped; every {kind.singular} that was {kind.activity} is saved. The same command continues."
-            )
+            raise Stopped(stop_message(results, f"every {kind.singular} that was {kind.activity}"))
         if failed := [f"{result.name}: {result.reason}" for result in results if result.state != "done"]:
             raise RunError(
                 f"{self.folder}: {len(failed)} of {total} {kind.plural} failed:\n  "
