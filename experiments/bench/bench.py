@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import sys
 import time
 import typing
 from collections.abc import Iterator, Mapping
@@ -47,6 +46,7 @@ from vdgs.config.serialization import diff_settings, to_dict
 from vdgs.distributed.executor import LogListener, Task, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.progress_table import STATE_STYLES
+from vdgs.distributed.scheduler import stop_message
 from vdgs.errors import Stopped, VdgsError
 from vdgs.evaluation.lpips import check_weights_file
 from vdgs.kernels import default_num_threads
@@ -54,6 +54,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_keys import hashable_settings
 from vdgs.synth import SynthOptions, generate
 from vdgs.system.atomic_files import read_json, to_jsonable, write_json, write_text
+from vdgs.system.child_python import python_command
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[BenchResult]:
         settings = replace(settings, plan_options=options)
         results, outcomes = _run_plan(make_plan(settings.table, options), settings, console)
     if any(each.state == "stopped" for each in outcomes.values()):
-        raise Stopped("Stopped; every run is saved. The same command continues.")
+        raise Stopped(stop_message(outcomes.values(), "every run"))
     errors = [each for each in outcomes.values() if each.state == "failed"]
     if errors:
         raise VdgsError(
@@ -188,7 +189,7 @@ def _train(
         stem = settings.output / "jobs" / run.name.replace("/", "__")
         job.write(stem.with_name(stem.name + ".json"))
         after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
-        command = [sys.executable, "-m", "experiments.bench.worker", str(stem.with_name(stem.name + ".json"))]
+        command = python_command("experiments.bench.worker", stem.with_name(stem.name + ".json"))
         output = stem.with_name(stem.name + ".log")
         tasks.append(Task(name=run.name, command=command, output=output, environment=_environment(), after=after))
     if done:

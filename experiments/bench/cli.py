@@ -11,6 +11,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import BIN_COUNT_RANGE
 from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, FlagName, Positional, Range
+from vdgs.config.typed_paths import MaybeFolder
 
 TableName = Literal[
     "table1", "table2", "table3", "table3-each", "table4", "factorial", "crossed", "paper-blocks",
@@ -37,7 +38,7 @@ class BenchArguments:
     """How many seeds (0, 1, ...); by default as many as the table has."""
     first_seed: Annotated[int, Range(0, MAX_COUNT)] = 0
     """The first of them, where other machines make those before it (--reuse-results puts them into one table)."""
-    scenes: tuple[str, ...] = ()
+    scenes: Annotated[tuple[str, ...], MaybeFolder()] = ()
     """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ... Or captures of
     your own, as folders: ./my-place. What says how a capture is read (--images, --downscale and on) is about these."""
     methods: tuple[str, ...] = ()

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from experiments.bench.definitions import RENDER_STAGES, BenchMethod
 from vdgs.captures.capture import Capture, View
+from vdgs.config.typed_paths import expand_home
 from vdgs.errors import VdgsError
 from vdgs.evaluation.comparison_images import unique_file_stems
 from vdgs.evaluation.evaluate_model import evaluate_model
@@ -42,7 +43,7 @@ def method_from_renders(text: str, known_methods: Iterable[BenchMethod]) -> Benc
     """A method from NAME=FOLDER. Raises VdgsError if it is not that, if a known method has the name, or without
     the folder."""
     title, _, folder = text.partition("=")
-    title = title.strip()
+    title, folder = title.strip(), expand_home(folder, Path)
     if not folder or not NAME_PATTERN.fullmatch(title):
         raise VdgsError(
             f"--renders {text!r}: give a name (letters a to z, digits, spaces, . + - _ and brackets) and a folder, as "

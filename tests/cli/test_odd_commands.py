@@ -12,7 +12,9 @@ import pytest
 from experiments.bench.cli import BenchArguments
 from support.captures import tiny_scene, write_colmap
 from support.commands import PATIENCE_SECONDS
+from vdgs.cli.argument_parser import parse_words
 from vdgs.cli.main import COMMANDS, main, verb_arguments
+from vdgs.cli.run_cmd import RunArguments
 from vdgs.config.options import Option, options_of
 from vdgs.config.output_paths import is_output
 from vdgs.errors import VdgsError
@@ -97,6 +99,33 @@ def test_an_output_that_no_disk_can_hold_is_refused_at_once(verb, option, kind, 
     assert ended.value.code == 1
     assert f"{word}: cannot be written (" in capsys.readouterr().err
     assert Path("file").read_text() == "kept"
+
+
+@pytest.mark.parametrize(("verb", "option"), path_options(), ids=lambda each: getattr(each, "flag", each))
+def test_a_path_that_begins_with_a_tilde_is_in_the_home_folder(verb, option, tmp_path, monkeypatch, capsys):
+    """Shells leave it as it is behind `--output=` and in quotes; a folder of this name would be made here."""
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "file").touch()
+    (tmp_path / "config.yaml").write_text("vdgs:\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(home))
+    with pytest.raises(SystemExit) as ended:
+        main(command(verb, option, "~/file/new.ply"))  # where none is, and none can be made
+    assert ended.value.code == 1
+    assert f"{home}/file/new.ply: " in capsys.readouterr().err
+    assert not Path("~").exists()
+
+
+def test_a_text_that_may_be_a_path_names_the_home_folder_too(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    given = parse_words(RunArguments, ["c", "--images=~/small", "--masks", "masks", "--output", "./~run"])
+    assert given.get("options", "images") == "/home/me/small"
+    assert given.get("options", "masks") == "masks"
+    assert given.get("output") == Path("~run")
+    assert parse_words(BenchArguments, ["toy", "--scenes", "~/place", "tiny"]).get("scenes") == (
+        "/home/me/place", "tiny",
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", ["run", "sfm", "inspect", "train-coarse"])

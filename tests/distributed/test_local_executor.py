@@ -15,6 +15,7 @@ from support.shard_scripts import job, run
 from vdgs.distributed import local_executor
 from vdgs.distributed.executor import LogListener, Task, TaskListener, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
+from vdgs.distributed.scheduler import stop_message
 from vdgs.distributed.shard_runner import ShardCommand
 from vdgs.distributed.task_process import PARENT_PID_VARIABLE, stop_when_parent_dies
 from vdgs.runs.stage_folder import StageFolder
@@ -255,7 +256,7 @@ jobs = [
     ShardCommand(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
 ]
 outcomes = run_shards(jobs, Counted(2, poll_seconds=0.02), Console())
-print("OUTCOMES", json.dumps([[o.state, o.attempts, o.reason] for o in outcomes]))
+print("OUTCOMES", json.dumps([[o.state, o.attempts, o.reason, o.was_killed] for o in outcomes]))
 """
 
 
@@ -302,6 +303,13 @@ def test_a_request_to_stop_reaches_each_job_once(tmp_path, number):
     assert not jobs[2].folder.path.exists() or not jobs[2].output.exists()
 
 
+def test_what_was_killed_is_not_called_saved():
+    done = [TaskResult(name="block 00", state="stopped", attempts=1), TaskResult(name="block 01", state="done")]
+    assert stop_message(done, "every block") == "Stopped; every block is saved. The same command continues."
+    killed = [TaskResult(name="block 02", state="stopped", attempts=1, was_killed=True)]
+    assert stop_message([*done, *killed], "every block").startswith("Stopped; ended before it could save: block 02. ")
+
+
 def test_a_second_interrupt_kills(tmp_path):
     jobs = [job(tmp_path, i, LONG) for i in range(2)]  # they may not end
     driver = Driver(jobs, tmp_path)
@@ -309,7 +317,7 @@ def test_a_second_interrupt_kills(tmp_path):
         driver.send_signal(signal.SIGINT)
     outcomes = driver.outcomes()
     assert [o[0] for o in outcomes] == ["stopped", "stopped"]
-    assert all("SIGKILL" in o[2] for o in outcomes)
+    assert all("SIGKILL" in o[2] and o[3] for o in outcomes)
     assert jobs[0].folder.status().state == "stopped"  # it could not write that itself
 
 

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from support.report_page import Page
 from vdgs.errors import RunError
 from vdgs.report import charts
 from vdgs.report.embedded_images import EmbeddedImage, load_embedded_image
-from vdgs.report.write_report import write_report
+from vdgs.report.write_report import link_exports, write_report
 from vdgs.runs.run_folder import RunFolder
 
 pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.slow]
@@ -220,6 +221,14 @@ def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
     write(run.path / "export.json", record)
     page.unlink()
     assert "Move through" not in write_report(run).read_text()
+
+
+@pytest.mark.usefixtures("blank_charts")
+def test_a_report_that_may_only_be_read_is_no_error_of_an_export(tmp_path):
+    run, said = coarse_run(tmp_path / "run"), Console(record=True, width=300, file=io.StringIO())
+    (run.path / "report.html").mkdir()  # stands for a folder that cannot be written, which root can
+    link_exports(run, said)
+    assert said.export_text() == f"note {run.path}/report.html cannot be written: it will not link to the page\n"
 
 
 @pytest.mark.usefixtures("blank_charts")

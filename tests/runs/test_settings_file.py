@@ -116,6 +116,14 @@ def test_a_file_that_does_not_work_is_explained(text, says, tmp_path):
     assert says in str(raised.value)
 
 
+def test_a_path_in_a_file_may_begin_in_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    (tmp_path / "settings.yaml").write_text("capture: {images: ~/small, gps: ~/gps.csv, georef: ./~g.json}")
+    options = read(tmp_path / "settings.yaml")[0]
+    assert (options.images, options.gps) == ("/home/me/small", Path("/home/me/gps.csv"))
+    assert options.georef == Path("~g.json")
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
 def test_files_are_read_as_programs_on_windows_save_them(encoding, tmp_path):
     (tmp_path / "settings.yaml").write_text("# der Größe nach\ntraining: {seed: 7}\n", encoding=encoding)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -127,10 +128,18 @@ def models_of(workspace: Workspace, key: str = "key") -> list[int]:
     return [len(model.images) for model in reconstruct._models(plan, workspace, key, 16, True, CONSOLE)]
 
 
+def python_that(folder: Path, script: str) -> str:
+    """A program that a shell script stands for; $1 is where the models of the global mapper belong."""
+    program = folder / "python"
+    program.write_text(f"#!/bin/sh\nshift $(($# - 3))\n{script}\n")
+    program.chmod(0o755)
+    return str(program)
+
+
 @pytest.mark.parametrize("why", ["no model", "another shape"])
-def test_parts_stay_where_all_at_once_is_no_better(copied, monkeypatch, why):
+def test_parts_stay_where_all_at_once_is_no_better(copied, monkeypatch, tmp_path, why):
     if why == "no model":
-        monkeypatch.setattr(global_mapper.sys, "executable", "false")
+        monkeypatch.setattr(sys, "executable", python_that(tmp_path, "touch $1/begun; exit 1"))
     else:
         monkeypatch.setattr(global_mapper, "MAX_MOVED_SHARE", 0.0)
     said = join(copied)
@@ -139,6 +148,15 @@ def test_parts_stay_where_all_at_once_is_no_better(copied, monkeypatch, why):
         f"all photographs at once: the {'mapper ended without a model' if why == 'no model' else 'part of 8'}" in said
     )
     assert not list(copied.path.glob("global-*"))
+
+
+def test_a_mapper_that_cannot_start_is_an_error_of_the_machine_and_work_goes_on_after_it(copied, monkeypatch, tmp_path):
+    with monkeypatch.context() as broken:
+        broken.setattr(sys, "executable", python_that(tmp_path, "echo no torch >&2; exit 1"))
+        with pytest.raises(VdgsError, match=r"cannot be started .*\(exit code 1 no torch\)"):
+            models_of(copied)
+    assert not list(copied.path.glob("global-*"))
+    assert models_of(copied) == [16]
 
 
 def interrupt(*_: object) -> str:
@@ -200,12 +218,10 @@ def test_models_that_are_made_anew_are_joined_anew(copied):
 
 def test_a_model_that_the_disk_cut_off_is_not_taken(copied, tmp_path):
     """COLMAP says nothing where it can write a part of a model only."""
-    program = tmp_path / "python"
-    program.write_text(f"#!/bin/sh\ncp -r {copied.models}/0 $5/0\ntruncate -s 100 $5/0/points3D.bin\n")
-    program.chmod(0o755)
+    program = python_that(tmp_path, f"cp -r {copied.models}/0 $1/0\ntruncate -s 100 $1/0/points3D.bin")
     incremental_mapper.set_models_aside(copied)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(global_mapper.sys, "executable", str(program))
+        patched.setattr(sys, "executable", program)
         with pytest.raises(VdgsError, match="could write a part only"):
             global_mapper.place_left_out(copied, 16, True, 1, CONSOLE)
     assert not list(copied.saved_snapshots.glob("*"))

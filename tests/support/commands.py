@@ -30,7 +30,7 @@ from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from support.forking import fork_tasks
+from support.forking import fork_tasks, module_of
 from support.pausing import Pause, pause_where_asked
 
 if TYPE_CHECKING:
@@ -118,8 +118,7 @@ class CommandsHere:
         from vdgs.distributed.executor import TaskResult
 
         for task in tasks:
-            python, option, extension, *arguments = task.command
-            assert (python, option) == (sys.executable, "-m")
+            extension, arguments = module_of(task.command)
             task.output.parent.mkdir(parents=True, exist_ok=True)
             with task.output.open("a") as output, redirect_stdout(output), redirect_stderr(output), threads_as_before():
                 code = _exit_code(importlib.import_module(extension).main, arguments)

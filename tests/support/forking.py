@@ -41,6 +41,13 @@ def fork_tasks() -> None:
     task_process.subprocess = SimpleNamespace(Popen=Forked, DEVNULL=None, STDOUT=None)  # type: ignore[assignment]
 
 
+def module_of(command: Sequence[str]) -> tuple[str, list[str]]:
+    """The module that a command of `child_python` runs, and its arguments."""
+    assert command[0] == sys.executable
+    module = command.index("-m") + 1
+    return command[module], list(command[module + 1 :])
+
+
 def start_tasks() -> None:
     """Let this process start what it starts, as people's do."""
     from vdgs.distributed import task_process
@@ -54,8 +61,7 @@ class _Forked:
     orders: Connection
 
     def __init__(self, command: Sequence[str], stdout: IO[bytes], env: Mapping[str, str], **_options: object):
-        python, option, module, *arguments = command
-        assert (python, option) == (sys.executable, "-m")
+        module, arguments = module_of(command)
         self._code: int | None = None
         self.pid = int(self._ask((module, arguments, stdout.name, dict(env))) or 0)
 

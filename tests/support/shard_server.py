@@ -58,11 +58,15 @@ def parent_of(process: int) -> int:
 def fork_shard_where_asked() -> None:
     """If this process was started to do a shard and the server forks one for it, end as that does. Called before all
     else."""
-    if VARIABLE not in os.environ or sys.orig_argv[1:3] != ["-m", MODULE]:
+    if VARIABLE not in os.environ or MODULE not in sys.orig_argv:
         return
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
         server.connect(os.environ[VARIABLE])
-        order = {"arguments": sys.orig_argv[3:], "folder": os.getcwd(), "environment": dict(os.environ)}
+        order = {
+            "arguments": sys.orig_argv[sys.orig_argv.index(MODULE) + 1 :],
+            "folder": os.getcwd(),
+            "environment": dict(os.environ),
+        }
         socket.send_fds(
             server,
             [json.dumps(order | {"started": os.getpid()}, ensure_ascii=False).encode(errors="surrogateescape")],

@@ -43,6 +43,7 @@ def test_a_shell_reads_names_back(tmp_path: Path) -> None:
     assert said_by("sh", [f"cat {shell_word(file)}" for file in files]) == "".join(f"here is {f.name}\n" for f in files)
     for line in (f"cat {shell_word(Path('-x'))}", shell_line(["cat", Path("-x")])):
         assert shlex.split(line) == ["cat", "./-x"]
+    assert shlex.split(shell_word(Path("~x"))) == ["./~x"]  # else vdgs takes it for a home folder, in quotes too
 
 
 def test_sbatch_reads_directives_back() -> None:

@@ -91,7 +91,7 @@ def check_images(
     if problems:
         raise CaptureError(
             f"{folder}: {len(problems)} of {len(views)} photographs or their masks cannot be used. "
-            f"Copy them again, or remove them from the model.{format_list(problems)}"
+            f"Copy those that are damaged again, or remove them from the model.{format_list(problems)}"
         )
     blank = [view.name for view in checked if view.blank]
     if len(blank) == len(checked):

@@ -31,6 +31,7 @@ from vdgs.captures.xmp_packets import exif_of
 from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
 from vdgs.system.native_messages import without_decoder_messages
+from vdgs.system.permissions import refusal
 
 # What libraries say of files on their own is for their makers: what cannot be read is said in our words.
 python_warnings.filterwarnings("ignore", module=r"PIL\.")
@@ -151,6 +152,8 @@ def read_header(path: Path) -> ImageHeader:
         raise
     except FileNotFoundError:
         raise CaptureError(f"{path}: no such image.") from None
+    except PermissionError as error:
+        raise CaptureError(f"{path}: {refusal(path, error)}") from None
     except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
         raise CaptureError(
             f"{path}: not an image that can be read ({error}). Copy it again, or convert it to 8-bit RGB if other "
@@ -305,6 +308,8 @@ def _decode(path: Path) -> np.ndarray:
     """Pixels as stored (BGR order), of a JPEG that lacks nothing but its end marker too."""
     try:
         data = np.fromfile(path, np.uint8)
+    except PermissionError as error:
+        raise CaptureError(f"{path}: {refusal(path, error)}") from error
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
     try:
@@ -385,6 +390,8 @@ def verify_image(path: Path) -> VerifiedImage:
             image.load()
             ranges = [_extremes(image, band) for band in image.getbands() if band != "A"]
             transparent = "A" in image.getbands() or "transparency" in image.info
+    except PermissionError as error:
+        raise CaptureError(f"{path}: {refusal(path, error)}") from None
     except Exception as error:  # any complaint of a decoder is what we came for
         raise CaptureError(f"{path}: {error}") from None
     return VerifiedImage(any(high != low for low, high in ranges), transparent)

@@ -17,6 +17,7 @@ from PIL import Image
 
 from vdgs.captures.optional_decoders import require_decoder
 from vdgs.errors import CaptureError
+from vdgs.system.permissions import refusal
 
 #: Suffixes of raw files. What is a JPEG inside is none.
 RAW_SUFFIXES = {
@@ -45,8 +46,11 @@ def _opened(path: Path) -> Iterator[Any]:
     """LibRaw's view of a file. Raises CaptureError for what LibRaw cannot read."""
     rawpy = require_decoder("rawpy", path)
     try:
+        path.open("rb").close()  # LibRaw does not say that it may not read a file
         with rawpy.imread(str(path)) as raw:
             yield raw
+    except PermissionError as error:
+        raise CaptureError(f"{path}: {refusal(path, error)}") from None
     except rawpy.LibRawError as error:
         said = error.args[0].decode(errors="replace") if isinstance(error.args[0], bytes) else error
         raise CaptureError(

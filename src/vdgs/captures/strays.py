@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
 from vdgs.errors import CaptureError
+from vdgs.system.permissions import refusal
 from vdgs.system.quoting import shell_word
 
 #: Folders that systems and programs keep for themselves; so are all whose names begin with a dot.
@@ -50,7 +52,7 @@ def why_not_read(folder: Path) -> str | None:
     """Why pictures in a folder below photographs are none, by its name or what marks it; None where they may be."""
     if _HIDDEN.fullmatch(folder.name):
         return "hidden, or of a system's or a program's own"
-    if _PRODUCTS.fullmatch(folder.name) or is_run(folder) or any((folder / mark).is_file() for mark in _MARKS):
+    if _PRODUCTS.fullmatch(folder.name) or is_run(folder) or any(os.path.isfile(folder / mark) for mark in _MARKS):
         return "results of a program"
     return None
 
@@ -87,11 +89,14 @@ def is_result(file: Path) -> bool:
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:
     """Each folder with its files, sorted, and the folders in it that are not entered, with the reason. Links are
-    followed, but not to a folder that is entered already or holds `folder`."""
+    followed, but not to a folder that is entered already or holds `folder`. Raises CaptureError for a folder that
+    cannot be read: nobody knows what is missing then."""
     top = Path(os.path.realpath(folder))
     been = {top, *top.parents}
-    for at, folders, files in os.walk(folder, followlinks=True):
+    for at, folders, files in os.walk(folder, followlinks=True, onerror=_refuse):
         here = Path(at)
+        if not os.access(here, os.X_OK):
+            _refuse(PermissionError(errno.EACCES, os.strerror(errno.EACCES), at))
         reasons = {here / name: why_not_read(here / name) for name in sorted(folders)}
         folders.clear()
         for path in sorted((path for path, why in reasons.items() if why is None), key=os.path.islink):
@@ -100,6 +105,13 @@ def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:
                 folders.append(path.name)
         folders.sort()
         yield here, [here / name for name in sorted(files)], {path: why for path, why in reasons.items() if why}
+
+
+def _refuse(error: OSError) -> None:
+    """Raise CaptureError for a folder whose files cannot be listed or read."""
+    folder, fault = Path(error.filename), f"cannot be read ({error.strerror}). See its disk"
+    said = refusal(folder, error) if isinstance(error, PermissionError) else fault
+    raise CaptureError(f"{folder}: the folder {said}, or move it elsewhere.")
 
 
 def is_hidden(name: PurePath) -> bool:

@@ -13,6 +13,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.output_paths import Output
 from vdgs.config.ranges import WORKER_COUNT, FlagName, Positional
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.config.typed_paths import MaybeFolder
 from vdgs.errors import CaptureError
 from vdgs.synth.synth_options import SynthOptions
 from vdgs.system.quoting import shell_line
@@ -90,7 +91,7 @@ class SfmArguments(QuietArguments):
     name.jpg.png; name_mask.jpg beside name.jpg is one too."""
     output: Annotated[Path, Output()]
     """Folder of the capture; new, or the one to go on with."""
-    project_images: Annotated[str | None, FlagName("images")] = None
+    project_images: Annotated[str | None, FlagName("images"), MaybeFolder()] = None
     """Folder of the photographs of a project of another program. Default: images beside it, or its whole folder."""
     gps: Path | None = None
     """Table of positions to use instead of those in the photographs: columns name,lat,lon,alt as exiftool, Metashape,

@@ -32,7 +32,7 @@ def export_command(arguments: list[str]) -> None:
         relocate_capture(RunFolder(args.run), args.capture)
     run = open_run(request.run, request.model, device)
     export_run(run, request, console, execution)
-    from vdgs.report.write_report import write_report
-
     if any(path.suffix.lower() == ".html" for path in request.output) and (args.run / REPORT_FILE).exists():
-        write_report(run.folder)  # it links to the page
+        from vdgs.report.write_report import link_exports
+
+        link_exports(run.folder, console)

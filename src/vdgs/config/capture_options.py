@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from vdgs.config.output_paths import Output
 from vdgs.config.ranges import MAX_COUNT, Range
+from vdgs.config.typed_paths import MaybeFolder
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every", "strips", "obliques"]
@@ -24,7 +25,7 @@ class CaptureOptions:
     format: CaptureFormat = "auto"
     """Format to read, where a folder holds several. auto: of a COLMAP model and transforms.json the
     model, unless transforms.json lists training and test photographs or names masks."""
-    images: str | None = None
+    images: Annotated[str | None, MaybeFolder()] = None
     """Image folder to use, such as images_4, in the capture or elsewhere. Default: images, or where absent the largest
     images_N. Of a project of another program: any folder that its photographs are in or below; default: images, or the
     whole folder."""
@@ -66,5 +67,5 @@ class CaptureOptions:
     of photographs as the cameras took them is used, whatever smaller ones there are."""
     undistorted_folder: Annotated[Path | None, Output()] = None
     """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
-    masks: str = "masks"
+    masks: Annotated[str, MaybeFolder()] = "masks"
     """Folder of masks (white = keep), named like the photographs. That is name.png or name.jpg.png."""

@@ -25,6 +25,7 @@ from typing import Any
 from vdgs.config.number_words import how_to_write, plain_number
 from vdgs.config.ranges import FlagName, Positional, Repeatable, to_flag
 from vdgs.config.type_hints import describe_type, field_hints, without_notes
+from vdgs.config.typed_paths import expand_home
 
 #: Other names of an option: shorter ones, and those that scripts of before use.
 ALIASES = {
@@ -100,7 +101,8 @@ class Option:
         if len(words) == 1 and count > 2 and words[0].count(",") == count - 1:  # as GIS programs write boxes
             words = words[0].split(",")
         try:
-            return read_words(self.hint, [plain_number(word, self.flag, self.hint) for word in words])
+            plain = [plain_number(expand_home(word, self.hint), self.flag, self.hint) for word in words]
+            return read_words(self.hint, plain)
         except ValueError:
             said, kind = " ".join(words).strip(), describe_type(self.hint).removesuffix(" or null")
             how = how_to_write(said, self.flag, self.hint)

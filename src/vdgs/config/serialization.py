@@ -15,6 +15,7 @@ from typing import Any
 from vdgs.config.number_words import how_to_write, plain_number
 from vdgs.config.ranges import to_flag
 from vdgs.config.type_hints import describe_type, field_hints, without_notes
+from vdgs.config.typed_paths import expand_home
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -58,7 +59,7 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings", *,
 
 
 def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -> dict[tuple[str, ...], Any]:
-    """The values of some settings of a config class, by the names of the fields down to them.
+    """The values of some settings of a config class, as people write them, by the names of the fields down to them.
 
     Raises what `from_dict` raises. `also` are further names that are there.
     """
@@ -72,7 +73,8 @@ def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -
             within = flat_values(typing.cast(type, inner), value, inside)
             flat |= {(name, *path): each for path, each in within.items()}
         else:
-            flat[(name,)] = _read_words(hints[name], value, inside)
+            typed = expand_home(value, hints[name]) if isinstance(value, str) else value
+            flat[(name,)] = _read_words(hints[name], typed, inside)
     return flat
 
 

@@ -71,6 +71,8 @@ class TaskResult:
     """Of the last attempt."""
     reason: str = ""
     """Empty when done."""
+    was_killed: bool = False
+    """It was asked to stop, and ended before it could save."""
     last_lines: tuple[str, ...] = ()
     """The end of what a failed one printed."""
 

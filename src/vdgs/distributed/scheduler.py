@@ -7,7 +7,7 @@ from __future__ import annotations
 import signal
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -229,7 +229,8 @@ class _TaskScheduler:
         elif code in EXIT_EXPLAINED:
             self._end(state, "failed", why or _silent_failure_text(state.task, _end_text(end)))
         elif self._stopping:
-            self._end(state, "stopped", f"ended by {_end_text(end)}; continues from its last checkpoint")
+            reason = f"ended by {_end_text(end)}; continues from its last checkpoint"
+            self._end(state, "stopped", reason, was_killed=True)
         else:
             self._crashed(state, end, why)
 
@@ -269,14 +270,24 @@ class _TaskScheduler:
         state.task = replace(state.task, resources=replace(resources, memory_bytes=increased))
         return f"it asks for {data_size(increased)} now"
 
-    def _end(self, state: _TaskState, end: EndState, reason: str = "") -> None:
+    def _end(self, state: _TaskState, end: EndState, reason: str = "", was_killed: bool = False) -> None:
         task = state.task
         seconds = time.monotonic() - state.start_time if state.attempts and state.start_time else 0.0
         lines = tuple(tail_lines(task.output, state.output_from)) if end == "failed" and state.started else ()
         state.result = TaskResult(
-            name=task.name, state=end, attempts=state.attempts, seconds=seconds, reason=reason, last_lines=lines
-        )
+            name=task.name, state=end, attempts=state.attempts, seconds=seconds, reason=reason, was_killed=was_killed,
+            last_lines=lines,
+        )  # fmt: skip
         self._listener.on_ended(task, state.result)
+
+
+def stop_message(results: Iterable[TaskResult], what: str) -> str:
+    """What to say where tasks were asked to stop: that `what` ran is saved, or which of it was ended before it was."""
+    killed = ", ".join(result.name for result in results if result.was_killed)
+    said = (
+        f"ended before it could save: {killed}. What is kept is the last checkpoint" if killed else f"{what} is saved"
+    )
+    return f"Stopped; {said}. The same command continues."
 
 
 def stage_iteration(folder: Path | None) -> int:

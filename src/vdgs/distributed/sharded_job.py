@@ -15,7 +15,6 @@ import hashlib
 import itertools
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -32,12 +31,14 @@ from vdgs.distributed.job_folders import SHARDS, clear, remove
 from vdgs.distributed.job_labels import JobLabels
 from vdgs.distributed.node_check import NodeRequirements, code_digest
 from vdgs.distributed.resource_allocation import Allocation, MachineResources, ShardWorkload
+from vdgs.distributed.scheduler import stop_message
 from vdgs.distributed.shard_runner import ShardCommand, run_shards
 from vdgs.errors import RunError, Stopped
 from vdgs.kernels import get_num_threads
 from vdgs.kernels.device_selection import AnyCard, cards_left_out, cards_of
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import write_json
+from vdgs.system.child_python import python_command
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.process_memory import available_memory_bytes
 
@@ -165,8 +166,9 @@ class ShardedJob:
         """Do these shards of a `total`. `on_ready` is called once machines are known to be fit, before anything starts;
         by default it marks the shards as queued.
 
-        Raises RunError if a shard failed (the others are done first), Stopped after Ctrl-C or SIGTERM (each saved), and
-        VdgsError where a machine of a cluster cannot do the work, before anything starts.
+        Raises RunError if a shard failed (the others are done first), Stopped after Ctrl-C or SIGTERM (each saved, but
+        for those that a second Ctrl-C kills), and VdgsError where a machine of a cluster cannot do the work, before
+        anything starts.
         """
         kind = self.kind
         workload = ShardWorkload(
@@ -212,17 +214,15 @@ class ShardedJob:
     def _command(self, index: int, allocation: Allocation, device: str) -> list[str]:
         # A GPU that a shard is given is not this machine's.
         device = "auto" if allocation.resources.gpus and device == "cpu" else device
-        return [
-            sys.executable, "-m", "vdgs.distributed.run_shard", str(self.folder), str(index), "--threads",
-            str(allocation.resources.cpus), "--image-cache-gb", f"{allocation.image_gb:.3f}", "--device", device,
-        ]  # fmt: skip
+        return python_command(
+            "vdgs.distributed.run_shard", self.folder, index, "--threads", allocation.resources.cpus,
+            "--image-cache-gb", f"{allocation.image_gb:.3f}", "--device", device,
+        )  # fmt: skip
 
     def _raise_unless_done(self, results: Sequence[TaskResult], total: int) -> None:
         kind = self.kind
         if any(result.state == "stopped" for result in results):
-            raise Stopped(
-                f"Stopped; every {kind.singular} that was {kind.activity} is saved. The same command continues."
-            )
+            raise Stopped(stop_message(results, f"every {kind.singular} that was {kind.activity}"))
         if failed := [f"{result.name}: {result.reason}" for result in results if result.state != "done"]:
             raise RunError(
                 f"{self.folder}: {len(failed)} of {total} {kind.plural} failed:\n  "

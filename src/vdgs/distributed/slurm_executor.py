@@ -33,6 +33,7 @@ from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, S
 from vdgs.distributed.slurm_job import SlurmTaskRecord, read_task_record
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json, write_text
+from vdgs.system.child_python import python_command
 from vdgs.system.documents import JsonObject
 from vdgs.system.quoting import sbatch_directive, shell_line, slurm_file_pattern
 
@@ -154,7 +155,7 @@ def make_batch_script(folder: Path, count: int, resources: TaskResources, option
     }
     words = [f"--{name}={value}" for name, value in directives.items() if value]
     lines = [sbatch_directive(word) for word in (*words, "--requeue", *options.sbatch_args)]
-    job = shell_line([sys.executable, "-m", "vdgs.distributed.slurm_job", str(folder)])
+    job = shell_line(python_command("vdgs.distributed.slurm_job", folder))
     setup = [options.setup_command] if options.setup_command else []
     return "\n".join(["#!/bin/bash", *lines, "", *setup, f"exec {job}", ""])
 

@@ -8,9 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import yaml
+from rich.console import Console
+from rich.markup import escape
 
 from vdgs.captures.output_guard import check_output
-from vdgs.errors import RunError
+from vdgs.errors import RunError, VdgsError
 from vdgs.report.html_page import Html, document, escape_html, join_html, paragraph, table_of_contents
 from vdgs.report.place_section import place_panel, read_place
 from vdgs.report.report_status import STATUS_META_NAME
@@ -75,6 +77,15 @@ def write_report(run: RunFolder) -> Path:
     )
     write_text(run.path / REPORT_FILE, page)
     return run.path / REPORT_FILE
+
+
+def link_exports(run: RunFolder, console: Console) -> None:
+    """Write the report again, which links to what was exported; a note where the run may only be read."""
+    try:
+        write_report(run)
+    except VdgsError:
+        file = escape(str(run.path / REPORT_FILE))
+        console.print(f"[yellow]note[/] {file} cannot be written: it will not link to the page")
 
 
 def _header(report: ReportedRun) -> tuple[Html, str]:

@@ -23,12 +23,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
-from vdgs.errors import CaptureError
+from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm import feature_matching, incremental_mapper
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.image_metadata import EXACT_MODEL
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import explain_disk_errors
+from vdgs.system.child_python import python_command
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -42,6 +43,8 @@ MAX_MOVED_SHARE, MAX_TURNED_DEG, MIN_PART = 0.02, 1.0, 5
 #: Its points are seen where they were before, within so many pixels more; and all points where they should be within so
 #: many in the mean.
 MAX_WORSE_PX, MAX_ERROR_PX = 0.1, 1.0
+#: What the process of the global mapper writes into its folder once it has loaded all that it needs.
+_BEGUN = "begun"
 _POLL_SECONDS = 0.2
 
 
@@ -61,7 +64,7 @@ def place_left_out(workspace: Workspace, count: int, fix_focal: bool, threads: i
     """Make models again, beginning with all photographs at once; those that were set aside (`set_models_aside`) are
     taken back, and why is said, where that places no more photographs, or changes the shape of a part.
 
-    Raises VdgsError for a full disk.
+    Raises VdgsError for a full disk, and where the process of the global mapper cannot start.
     """
     parts = incremental_mapper.read_models(workspace, aside=True)
     try:
@@ -106,7 +109,7 @@ def _map_globally(
     try:
         with report_progress(workspace, console, "mapping", count, f"{placed} placed, now all at once, ") as tell:
             tell(placed)
-            said = _run_apart((workspace.database, workspace.images, folder, threads, int(fix_focal)), folder / "log")
+            said = _run_apart((workspace.database, workspace.images, folder, threads, int(fix_focal)), folder)
         if said or not any(each.is_dir() for each in folder.iterdir()):
             return f"the mapper ended without a model {said}".strip()
         with explain_disk_errors(workspace.path):
@@ -120,10 +123,12 @@ def _map_globally(
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _run_apart(arguments: Sequence[object], log: Path) -> str:
-    """Run `map_globally` in a process of its own; what it said last where it failed."""
+def _run_apart(arguments: Sequence[object], folder: Path) -> str:
+    """Run `map_globally` in a process of its own; what it said last where it failed. Raises VdgsError where it ends
+    before it begins: that is a fault of the machine, and says nothing of the photographs."""
+    log = folder / "log"
     with log.open("wb") as output:
-        command = [sys.executable, "-m", __name__, *map(str, arguments)]
+        command = python_command(__name__, *arguments)
         process = subprocess.Popen(command, stdout=output, stderr=output)
     try:
         while process.poll() is None:
@@ -132,8 +137,14 @@ def _run_apart(arguments: Sequence[object], log: Path) -> str:
     finally:
         process.kill()
         process.wait()
-    said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-    return f"({' '.join([f'exit code {process.returncode}', *said])})" if process.returncode else ""
+    last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+    said = f"({' '.join([f'exit code {process.returncode}', *last])})" if process.returncode else ""
+    if said and not (folder / _BEGUN).exists():
+        raise VdgsError(
+            f"COLMAP's global mapper cannot be started in a process of its own {said}. `vdgs doctor` says what this "
+            "machine lacks; the same command then continues."
+        )
+    return said
 
 
 def map_globally(database: Path, images: Path, output: Path, threads: int, fix_focal: bool) -> None:
@@ -145,6 +156,7 @@ def map_globally(database: Path, images: Path, output: Path, threads: int, fix_f
     adjustment.refine_focal_length = not fix_focal
     options.mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
     options.mapper.retriangulation.ignore_two_view_tracks = False
+    (output / _BEGUN).touch()
     pycolmap.global_mapping(database, images, output, options)
 
 

@@ -30,6 +30,7 @@ from vdgs.sfm.focal_length import Lens, read_lens
 from vdgs.sfm.map_datums import to_wgs84
 from vdgs.sfm.spectral_bands import band_of
 from vdgs.sfm.xmp import first_number, read_xmp, text
+from vdgs.system.permissions import refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +243,8 @@ def _read_head(path: Path) -> tuple[int, ImageTags, dict[str, str], bool]:
         raise UnusableImage(str(error).removeprefix(f"{path}: ")) from None
     except UnidentifiedImageError:
         raise UnusableImage(_not_an_image(path)) from None
+    except PermissionError as error:
+        raise UnusableImage(refusal(path, error)) from None
     except OSError as error:
         why = "it is cut off" if "truncated" in str(error) else str(getattr(error, "strerror", None) or error)
         raise UnusableImage(f"cannot be read ({why}): copy it again") from None

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from vdgs.system.broken_packages import explain_broken_packages
@@ -60,6 +61,10 @@ def _explain(error: Exception) -> str:
         if not error.filename:
             _forget_output()
         what = error.filename or "a file, or what is printed"
+        if isinstance(error, PermissionError) and isinstance(what, str):
+            from vdgs.system.permissions import barred_by
+
+            what = barred_by(Path(what))  # else perhaps a file of which nobody knows whether it is there
         return f"{what}: {error.strerror or error}{_remedy(error)}"
     if isinstance(error, MemoryError | RuntimeError):
         from vdgs.system.memory.process_memory import is_out_of_memory

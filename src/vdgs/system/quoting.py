@@ -18,8 +18,9 @@ _BLANKED_BY_SBATCH = re.compile(r"(het|pack)(job)", re.IGNORECASE)
 
 
 def shell_word(text: str | Path) -> str:
-    """One word for a POSIX shell, also for lines that people copy; a path is none of a command's options."""
-    word = f"./{text}" if isinstance(text, Path) and str(text).startswith("-") else str(text)
+    """One word for a POSIX shell, also for lines that people copy; a path is none of a command's options, and
+    in no home folder."""
+    word = f"./{text}" if isinstance(text, Path) and str(text).startswith(("-", "~")) else str(text)
     return shlex.quote(word)
 
 

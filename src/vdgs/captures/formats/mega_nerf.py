@@ -32,6 +32,7 @@ from vdgs.captures.name_resolution import to_nfc
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
+from vdgs.system.permissions import refusal
 
 #: Ground axes (right, forward, up) from DRB axes.
 GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -138,6 +139,8 @@ def _load(file: Path) -> JsonObject:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise CaptureError(f"{file}: no such file; Mega-NeRF's layout needs it.") from None
+    except PermissionError as error:
+        raise CaptureError(f"{file}: {refusal(file, error)}") from None
     except Exception as error:  # its parsers raise many kinds on damaged files
         if "Unsupported global" in str(error):
             raise CaptureError(
