@@ -186,8 +186,8 @@ def test_bands_of_color_are_released_one_after_the_other_and_opacities_are_reset
     assert not state.gaussians.shN[:, 3:].any()
 
 
-def test_after_the_last_decision_opacities_stay():
-    last = replace(CONFIG, density=replace(CONFIG.density, until=0.25, reset_interval=20))  # that of step 20
+def test_where_density_control_ends_opacities_stay():
+    last = replace(CONFIG, density=replace(CONFIG.density, until=0.25, reset_interval=20))  # at step 20
     assert float(run(start(), stage(last), until=20).gaussians.opacity_logits.sigmoid().max()) > 0.05
 
 
