@@ -291,10 +291,7 @@ def _check_same_capture(scene: BenchScene, folder: Path, runs: Sequence[PlannedR
         try:
             check_same_capture(run.capture_file, read_json(run.capture_file), capture)
         except RunError as error:
-            raise VdgsError(
-                f"{run.path}: was trained on other photographs, cameras or points than {folder} has now, or with other "
-                "views held out. Give another --output, or the capture as it was."
-            ) from error
+            raise VdgsError(f"{error}. Of a bench: give another --output") from error
 
 
 def _key(run: PlannedRun, plan: BenchPlan, settings: BenchSettings) -> str:

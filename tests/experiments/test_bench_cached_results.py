@@ -100,7 +100,7 @@ def test_other_photographs_under_the_same_name_are_trained(data, there, tmp_path
     assert "0 of 2 runs are known" in said
     assert results["baseline", 0].figures["psnr"] != known_psnr(there, "baseline")
     before = models(tmp_path / "out")
-    with pytest.raises(VdgsError, match=r"0: was trained on other photographs, .* Give another --output"):
+    with pytest.raises(VdgsError, match=r"changed: photographs\. .* give another --output"):
         bench(asked(data, tmp_path / "out"))
     again, said = bench(asked(other, tmp_path / "out"))
     assert "3 of 3 runs are finished already" in said
