@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,9 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import write_json
+
+#: In an evaluation folder: how many seconds measuring took. A baseline trains and measures in one stage.
+EVALUATION_STATUS = "status.json"
 
 
 class BaselineModel(Protocol):
@@ -79,11 +83,13 @@ def evaluate_baseline(
     visibility_map: Any = None,
 ) -> dict[str, Any]:
     """Measure a model on the test views, and on the off-path views where the capture has them; writes the evaluation
-    folder `output` (and `output`_off_path) and returns what its metrics.json holds.
+    folder `output` (and `output`_off_path), how long that took (`EVALUATION_STATUS`), and returns what its metrics.json
+    holds.
 
     `visibility_map(camera)` is V per pixel; without it there are no figures by visibility. Raises RunError without test
     views or for another capture than the model's.
     """
+    began = time.monotonic()
     check_same_capture(output, facts.capture, capture)
     lpips, note = load_lpips(lpips_weights)
 
@@ -110,6 +116,7 @@ def evaluate_baseline(
         result = evaluate_model(
             photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
         )
+    write_json(output / EVALUATION_STATUS, {"seconds": time.monotonic() - began})
     if facts.num_gaussians is None:
         return dict(result)
     of_gaussians = {**dict(result), "n_gaussians": facts.num_gaussians}

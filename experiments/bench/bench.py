@@ -13,7 +13,7 @@ import fcntl
 import os
 import time
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +39,7 @@ from experiments.bench.result_tables import make_result_tables
 from experiments.bench.results import BenchResult, collect_results, results_to_json
 from experiments.bench.table_writers import to_latex, to_markdown, to_tidy_csv
 from experiments.bench.worker import BenchJob
+from vdgs.captures.capture_metadata import capture_fingerprint, check_same_capture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import check_not_among_files, check_output
 from vdgs.config.capture_options import CaptureOptions
@@ -47,7 +48,7 @@ from vdgs.distributed.executor import LogListener, Task, TaskResult
 from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.progress_table import STATE_STYLES
 from vdgs.distributed.scheduler import stop_message
-from vdgs.errors import Stopped, VdgsError
+from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.lpips import check_weights_file
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
@@ -107,6 +108,7 @@ def _run_plan(
     plan: BenchPlan, settings: BenchSettings, console: Console
 ) -> tuple[list[BenchResult], dict[str, TaskResult]]:
     """Train and measure what is not finished, and write the tables; the results, and how each run ended."""
+    plan = _with_contents(plan, settings)
     cached = read_cached_results(settings.reuse_results)
     keys = {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs}
     remaining = drop_cached_runs(plan, keys, cached)
@@ -131,6 +133,25 @@ def _check_output_outside_inputs(output: Path, plan: BenchPlan) -> None:
         if scene.folder is not None:
             names = [scene.options.get("images"), scene.options.get("masks")]
             check_not_among_files(output, scene.folder, [scene.folder / name / "any" for name in names if name])
+
+
+def _with_contents(plan: BenchPlan, settings: BenchSettings) -> BenchPlan:
+    """The plan, its scenes under --data with their fingerprints: runs hold for what lies there, not for its name.
+
+    A scene that cannot be read keeps its name alone. What was trained on any capture has another key, so that its runs
+    are to be trained, where `_captures` or the run says what is wrong.
+    """
+
+    def read(scene: BenchScene) -> BenchScene:
+        if scene.capture is None or settings.data is None:
+            return scene
+        try:
+            capture = load_capture(settings.data / scene.capture, CaptureOptions(**scene.options))
+        except VdgsError:
+            return scene
+        return replace(scene, contents=capture_fingerprint(capture))
+
+    return replace(plan, scenes=tuple(map(read, plan.scenes)))
 
 
 def _captures(
@@ -180,6 +201,11 @@ def _train(
     threads = max(1, default_num_threads() // settings.jobs)
     for run in wanted:
         _check_same_settings(settings, run)
+    for scene in plan.scenes:
+        if scene.name in captures:
+            _check_same_capture(
+                scene, captures[scene.name], [run for run in wanted if run.scene == scene.name], settings
+            )
     for run in wanted:
         job = _job(run, plan, captures[run.scene], keys[run.name], settings, threads)
         if _is_done(settings.output, run, job.key):
@@ -253,6 +279,20 @@ def _check_same_settings(settings: BenchSettings, run: PlannedRun) -> None:
             + "\nGive the old options to continue, --overwrite to train again what depends on them, or another "
             "--output."
         )
+
+
+def _check_same_capture(scene: BenchScene, folder: Path, runs: Sequence[PlannedRun], settings: BenchSettings) -> None:
+    """Raise VdgsError, before anything is trained, if the folder of a run was filled from another capture."""
+    filled = [RunFolder(settings.output / run.folder) for run in runs]
+    filled = [run for run in filled if run.capture_file.exists()]
+    if settings.overwrite or not filled:
+        return
+    capture = load_capture(folder, _options(scene, settings))
+    for run in filled:
+        try:
+            check_same_capture(run.capture_file, read_json(run.capture_file), capture)
+        except RunError as error:
+            raise VdgsError(f"{error}. Of a bench: give another --output") from error
 
 
 def _key(run: PlannedRun, plan: BenchPlan, settings: BenchSettings) -> str:

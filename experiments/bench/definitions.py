@@ -127,8 +127,8 @@ class BenchScene:
     preset: PresetName = "laptop"
     #: Path below --data; None for a generated scene.
     capture: str | None = None
-    #: Where it lies, if it was given as a folder, and its fingerprint (`captures.capture_metadata`): folders may share
-    #: a name.
+    #: Where it lies, if it was given as a folder, and the fingerprint of what lies there or under --data
+    #: (`captures.capture_metadata`): folders may share a name.
     folder: Path | None = None
     contents: Mapping[str, int] = field(default_factory=dict)
     #: SynthOptions by name.

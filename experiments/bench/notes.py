@@ -63,7 +63,9 @@ def _fairness(plan: BenchPlan) -> str:
         "which it is notes below that they get less or more; where a cut gives fewer blocks than asked for, a method "
         "gets fewer iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
-        "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
+        "all that leads from photographs to the model, measuring aside: starts and their stereo, V, the cut, the "
+        "assignment, the steps of all blocks as if one after the other, merging. Before 2026-11-28 it was the steps "
+        "alone. It depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
     if any(run.config.block.crop == "fixed-pixels" for run in plan.runs if has_block_folders(run.stages)):
@@ -76,8 +78,8 @@ def _fairness(plan: BenchPlan) -> str:
     ]
     if plan.step_factors:
         notes = [
-            "At equal time: each method with its iterations times the factor by which its time, at equal iterations in "
-            f"the table beside this one, was below that of `{plan.table.ours}`. "
+            "At equal time: each method with its iterations times the factor that fills, by what its steps and the "
+            f"rest took in the table at equal iterations beside this one, the time of `{plan.table.ours}`. "
             + "; ".join(f"{method} on {scene}: {factor:g}" for scene, method, factor in plan.step_factors),
             *notes[1:],
         ]

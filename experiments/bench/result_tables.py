@@ -86,6 +86,7 @@ COST_COLUMNS = (
     TableColumn("blocks", "blocks", 0, 0),
     TableColumn("cameras a block", "cameras_per_block", 0, 0),
     TableColumn("training s", "seconds", 0, 0),
+    TableColumn("of it besides steps s", "preparation_seconds", 0, 0),
     TableColumn("blocks s", "block_seconds", 0, 0),
     TableColumn("longest block s", "longest_block_seconds", 0, 0),
     TableColumn("block memory GB", "block_memory_bytes", 2, 0, 1e-9),

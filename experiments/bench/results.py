@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from experiments.baselines.evaluation import EVALUATION_STATUS
 from experiments.baselines.gaussian_blocks.cut import GaussianCut
 from experiments.baselines.gaussian_blocks.training import block_statuses
 from experiments.bench.baseline_stages import baseline_folder
@@ -103,7 +104,7 @@ def _read(output: Path, planned: PlannedRun, result: BenchResult) -> BenchResult
     }
     figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
     if planned.renders is None:
-        figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))
+        figures |= _sizes(metrics, planned) | _costs(run, planned.stages, _stage_seconds(output, planned, record))
     bounds, measured = _groups(run.path / GROUPS_FILE, "@", figures)
     by_frusta, _ = _groups(run.path / FRUSTA_FILE, "@frusta", figures)
     figures["unseen_share"] = measured.get("unseen_share")
@@ -137,9 +138,36 @@ def _photographs_drawn(status: StatusRecord) -> float:
     return float(status.images_drawn if status.images_drawn is not None else status.iteration or 0)
 
 
-def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) -> dict[str, float | None]:
-    """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`. The shared coarse
-    stage counts in full for each run that takes it."""
+def _stage_seconds(output: Path, planned: PlannedRun, record: Mapping[str, Any]) -> dict[str, float]:
+    """By the clock, stage by stage; a coarse stage that was taken over took as long as where it was trained."""
+    seconds = dict(record.get("seconds", {}))
+    shared = None if planned.coarse_from is None else output / planned.coarse_from / RECORD_FILE
+    if shared is not None and shared.exists():
+        seconds |= {name: taken for name, taken in read_json(shared)["seconds"].items() if name == "coarse"}
+    return seconds
+
+
+def _whole_seconds(run: RunFolder, stages: Sequence[str], clock: Mapping[str, float], loops: Sequence[float]) -> float:
+    """From the photographs to the model, without measuring it: also starts and their stereo, V, the cut, the assignment
+    and merging, as `clock` has them by stage. Blocks in processes of their own count by what they note themselves,
+    since starting Python is no part of a method. No stage counts less than it notes itself: of one that was
+    interrupted, the clock has the last part alone.
+
+    `loops`: seconds of the coarse training and of each block, or of a method that trains in one stage.
+    """
+    if baseline_folder(run, tuple(stages)) is not None:
+        evaluation = run.evaluation / EVALUATION_STATUS
+        measuring = read_json(evaluation)["seconds"] if evaluation.exists() else 0.0
+        return max(clock.get(stages[0], 0.0) - measuring, sum(loops))
+    partition, merged = run.partition_record().seconds, run.merged.status().merge_seconds
+    noted = {"coarse": loops[0], "partition": partition or 0.0, "merge": merged or 0.0, "momentum-gs": sum(loops[1:])}
+    whole = sum(max(clock.get(name, 0.0), noted[name]) for name in stages if name in noted)
+    return whole + sum(loops[1:]) * ("blocks" in stages)
+
+
+def _costs(run: RunFolder, names: Sequence[str], clock: Mapping[str, float]) -> dict[str, float | None]:
+    """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`, which took `clock`.
+    The shared coarse stage counts in full for each run that takes it."""
     own = baseline_folder(run, tuple(names))
     if own is not None and has_gaussian_blocks(names):
         coarse, trained = StageFolder(own.path / "coarse").status(), block_statuses(own.path)
@@ -151,6 +179,8 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
         trained = [folder.status() for folder in run.block_folders()] if in_blocks else []
         cameras = [row.cameras for row in run.partition_record().blocks] if in_blocks else []
     seconds = [float(each.seconds or 0) for each in trained]
+    loops = [float(coarse.seconds or 0), *seconds]
+    whole = _whole_seconds(run, names, clock, loops)
     peaks = [each.peak_memory_bytes or 0 for each in [coarse, *trained]]
     known = {
         "iterations": (coarse.iteration or 0) + sum(each.iteration or 0 for each in trained),
@@ -158,8 +188,8 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
         "coarse_seconds": coarse.seconds,
         "block_seconds": sum(seconds) if trained else None,
         "longest_block_seconds": max(seconds, default=None),
-        "seconds": float(coarse.seconds or 0) + sum(seconds),
-        "partition_seconds": stages.get("partition"),
+        "seconds": whole,
+        "preparation_seconds": whole - sum(loops),
         "peak_memory_bytes": max(peaks),
         "block_memory_bytes": max(peaks[1:], default=None),
         "blocks": len(trained) or None,

@@ -9,17 +9,21 @@ import pytest
 from rich.console import Console
 
 from experiments.baselines.gs3d.density import DensityConfig
+from experiments.baselines.momentum_gs.blocks import MomentumTraining
+from experiments.baselines.momentum_gs.guidance import MomentumConfig
 from experiments.bench.baseline_stages import BASELINES
+from support.block_training import CONFIG, block_stage, coarse
 from support.captures import tiny_scene, write_colmap
-from support.fake_device import pretended_card
+from support.fake_device import CARD, pretended_card
 from vdgs import kernels
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import BlockConfig, MethodConfig, PartitionConfig, TrainConfig
+from vdgs.config.method import BlockConfig, CompensationConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.kernels import torch_ref
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.torch_ref import adam
 from vdgs.runs.run_folder import RunFolder
+from vdgs.training import FrozenAnchors, initial_state
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("octree_gs")]
 METHOD = MethodConfig(
@@ -50,17 +54,50 @@ def busy(settings):
     return replace(settings, **parts)
 
 
-@pytest.mark.parametrize("name", BASELINES)
-def test_a_method_trains_and_is_measured_on_the_card(name, capture, tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def kernels_of_a_card(monkeypatch) -> None:
     monkeypatch.setenv(kernels.KERNELS_ENV_VAR, "torch_ref")
     adam.bias_correction_tables.cache_clear()  # kept for a card, and each test has its own
-    drawn, draw, baseline = set[str](), torch_ref.rasterize, BASELINES[name]
+
+
+@pytest.fixture
+def drawn(monkeypatch) -> set[str]:
+    """The devices that something is drawn on."""
+    devices, draw = set[str](), torch_ref.rasterize
 
     def watched(splats: Splats, *rest: Any, **named: Any) -> Raster:
-        drawn.add(splats.means_px.device.type)
+        devices.add(splats.means_px.device.type)
         return draw(splats, *rest, **named)
 
     monkeypatch.setattr(torch_ref, "rasterize", watched)
+    return devices
+
+
+def test_blocks_of_momentum_gs_train_on_the_card():
+    """They are one stage of a run: its others, which are the package's own, have tests of their own."""
+    growth = replace(CONFIG.densify, every=2, start=2)
+    settings = replace(CONFIG, iterations=2, densify=growth, compensation=CompensationConfig(enabled=False))
+    with pretended_card():
+        problems, states, decoder = [], [], coarse()[1].to(CARD)
+        for index in range(2):
+            problem, state = block_stage(BlockConfig(), index, settings)
+            around = problem.frozen_anchors
+            assert around is not None
+            around = FrozenAnchors(around.anchors.to(CARD), decoder)
+            problem = replace(problem, frozen_decoder=False, kind="block", device=CARD, frozen_anchors=around)
+            problems.append(problem)
+            states.append(initial_state(state.anchors.to(CARD), decoder, problem))
+        before = [len(state.anchors) for state in states]
+        training = MomentumTraining(states, problems, MomentumConfig())
+        while training.advance() is not None:
+            pass
+        assert {state.anchors.positions.device.type for state in training.states} == {"cuda"}
+        assert all(len(state.anchors) > n for state, n in zip(training.states, before, strict=True))
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_method_trains_and_is_measured_on_the_card(name, capture, tmp_path, drawn):
+    baseline = BASELINES[name]
     with pretended_card():
         baseline.run(
             RunFolder(tmp_path), capture, busy(baseline.settings(METHOD)), Console(quiet=True), lpips_weights=None,

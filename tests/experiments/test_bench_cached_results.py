@@ -2,9 +2,11 @@
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 from rich.console import Console
 
@@ -50,6 +52,10 @@ def known_psnr(file: Path, method: str) -> float:
     return next(each.figures["psnr"] for each in read_cached_results([file]).values() if each.method == method)
 
 
+def models(output: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in output.rglob("*.safetensors")}
+
+
 @pytest.fixture(autouse=True)
 def here(monkeypatch) -> None:
     monkeypatch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
@@ -82,6 +88,24 @@ def test_another_seed_is_trained_beside_it(data, there, tmp_path):
     assert results["baseline", 1].groups
     assert results["baseline", 0].figures["psnr"] == known_psnr(there, "baseline")
     assert "of other pixels" in text
+
+
+def test_other_photographs_under_the_same_name_are_trained(data, there, tmp_path):
+    """Neither what another bench measured holds for them, nor a finished run in the same folder."""
+    other = tmp_path / "data"
+    shutil.copytree(data, other)
+    for file in (other / "copr" / "images_4").iterdir():
+        cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
+    results, said = bench(asked(other, tmp_path / "out", known=(there,)))
+    assert "0 of 2 runs are known" in said
+    assert results["baseline", 0].figures["psnr"] != known_psnr(there, "baseline")
+    before = models(tmp_path / "out")
+    with pytest.raises(VdgsError, match=r"changed: photographs\. .* give another --output"):
+        bench(asked(data, tmp_path / "out"))
+    again, said = bench(asked(other, tmp_path / "out"))
+    assert "3 of 3 runs are finished already" in said
+    assert again == results
+    assert models(tmp_path / "out") == before
 
 
 def test_other_settings_are_another_run(data, there, tmp_path):

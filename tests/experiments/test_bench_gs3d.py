@@ -27,6 +27,7 @@ from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, Stopped
 from vdgs.runs.open_run import open_run
 from vdgs.runs.run_folder import RunFolder
+from vdgs.system.atomic_files import read_json
 
 pytestmark = [pytest.mark.xdist_group("bench_gs3d"), pytest.mark.slow]
 
@@ -156,6 +157,14 @@ def test_methods_that_train_in_blocks_stand_beside_the_others(data, tmp_path, mo
         for figure in ("psnr", "psnr@0", "longest_block_seconds", "block_memory_bytes", "cameras_per_block", "fps"):
             assert figures[figure] is not None, (name, figure)
         assert (figures["anchors"] is None) == (name != "momentum-gs")
+        # All that leads to the model counts, the cut and a coarse stage that was taken over too; measuring does not.
+        run = tmp_path / result.folder
+        clock = read_json(run / "bench.json")["seconds"]
+        for shared in tmp_path.glob("runs/copr/shared-coarse-*/0/bench.json"):
+            clock |= {stage: taken for stage, taken in read_json(shared)["seconds"].items() if stage in clock}
+        measuring = clock.get("evaluate", read_json(run / "evaluation" / "status.json")["seconds"])
+        assert figures["seconds"] == pytest.approx(sum(clock.values()) - measuring)
+        assert 0 < figures["preparation_seconds"] < figures["seconds"]
     text = (tmp_path / "table1" / "table.md").read_text()
     assert all(f"{METHODS[name].title} ({METHODS[name].citation})" in text for name in names)
 

@@ -266,6 +266,19 @@ def test_at_equal_time_dear_methods_make_fewer_iterations():
         step_factors(plan, results[:4])
 
 
+def test_what_does_not_grow_with_iterations_is_taken_off_before_time_is_shared_out():
+    """Of 10 s of `full` 4 are a cut; 2 s of 3DGS are all steps; a cut of 12 s leaves no time for steps."""
+    methods = ("3dgs-black", "octree-gs", "full")
+    plan = make_plan("table1", PlanOptions(scenes=("tiny",), methods=methods, seeds=1))
+    seconds = {"3dgs-black": (2.0, 0.0), "octree-gs": (14.0, 12.0), "full": (10.0, 4.0)}
+    results = [
+        BenchResult("tiny", name, 0, "done", figures={"seconds": whole, "preparation_seconds": fixed})
+        for name, (whole, fixed) in seconds.items()
+    ]
+    expected = (("tiny", "3dgs-black", 5.0), ("tiny", "octree-gs", 0.05), ("tiny", "full", 1.0))
+    assert step_factors(plan, results) == expected
+
+
 def test_large_scenes_of_a_table_have_one_seed_unless_more_are_asked_for():
     assert {seed for scene, _, seed in make_plan("table1", PlanOptions()).run_of if scene == "seneca"} == {0}
     assert {seed for scene, _, seed in make_plan("table1", PlanOptions()).run_of if scene == "copr"} == {0, 1, 2}

@@ -1,4 +1,5 @@
-"""DOGS: one block is 3DGS, equal blocks stay equal, blocks agree on the mean, and a stop changes nothing."""
+"""DOGS: equal blocks stay equal, blocks agree on the mean, and a stop changes nothing (one block is 3DGS:
+test_gaussian_blocks.py)."""
 
 import json
 from dataclasses import replace
@@ -16,7 +17,6 @@ from experiments.baselines.dogs.training import DogsTraining, begin_consensus, r
 from experiments.baselines.gaussian_blocks.cut import GaussianCut
 from experiments.baselines.gaussian_blocks.training import GaussianBlocksConfig, train_scene
 from experiments.baselines.gs3d.model import initialize_gaussians
-from experiments.baselines.gs3d.run import train_gs3d
 from experiments.baselines.gs3d.schedule import scale_schedule
 from experiments.baselines.gs3d.training import Gs3dConfig, Gs3dProblem, Gs3dState, initial_state, scene_extent
 from support.captures import tiny_scene, write_colmap
@@ -91,15 +91,6 @@ def test_cameras_train_the_points_of_their_place_in_the_grid():
         assert len(views) < 30
     shares = np.bincount(cut.blocks.owner(points[:, :2])) / len(points)
     assert shares.min() > 0.15
-
-
-def test_one_block_is_3dgs(capture, tmp_path):
-    published = scale_schedule(24, Gs3dConfig(background="mean"))
-    config = GaussianBlocksConfig(blocks=1, iterations=24, scene=published)
-    one = train_scene(capture, config, StageFolder(tmp_path / "one"), train_dogs, QUIET)
-    alone = train_gs3d(capture, published, tmp_path / "alone", QUIET)
-    assert bits(one.gaussians) == bits(alone.gaussians)
-    assert StageFolder(tmp_path / "one").status().iteration == 24
 
 
 def test_a_scene_that_is_stopped_while_blocks_agree_continues(capture, tmp_path, monkeypatch):

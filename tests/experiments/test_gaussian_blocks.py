@@ -1,7 +1,9 @@
 """Explicit Gaussians in blocks: CityGaussian, VastGaussian and DOGS, by their laws."""
 
 import io
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ import torch
 from rich.console import Console
 
 from experiments.baselines.citygaussian.training import fine_tuning, train_citygaussian
+from experiments.baselines.dogs.training import train_dogs
 from experiments.baselines.gaussian_blocks.cut import GaussianCut, cut_by_removal, cut_points, merge_cells
-from experiments.baselines.gaussian_blocks.training import GaussianBlocksConfig, train_scene
+from experiments.baselines.gaussian_blocks.training import BlockScene, GaussianBlocksConfig, train_scene
+from experiments.baselines.gs3d import schedule
 from experiments.baselines.gs3d import session as gaussian_session
 from experiments.baselines.gs3d.model import GaussianModel, initialize_gaussians
 from experiments.baselines.gs3d.run import train_gs3d
@@ -28,6 +32,7 @@ from vdgs.runs.stage_folder import StageFolder
 
 pytestmark = pytest.mark.xdist_group("gaussian_blocks")
 QUIET = Console(quiet=True)
+PLAIN_VASTGAUSSIAN = partial(train_vastgaussian, appearance=False)
 
 
 @pytest.fixture(scope="module")
@@ -47,18 +52,57 @@ def bits(gaussians) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in gaussians.tensors().items()}
 
 
+def blocks_of(folder: Path) -> list[Path]:
+    return sorted((folder / "blocks").iterdir())
+
+
 def plane(n: int = 200):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-4, 4, (n, 2)), np.zeros((n, 1))], axis=1)
     return points, initialize_gaussians(points, np.full((n, 3), 128, np.uint8), 0.5, 1)
 
 
-def test_one_block_of_vastgaussian_without_appearance_is_3dgs(capture, tmp_path):
-    plain = partial(train_vastgaussian, appearance=False)
-    one = train_scene(capture, config(1, 12), StageFolder(tmp_path / "one"), plain, QUIET)
-    alone = train_gs3d(capture, scale_schedule(12, Gs3dConfig(background="mean")), tmp_path / "alone", QUIET)
+@pytest.fixture
+def often(monkeypatch) -> None:
+    """Decisions about density every four steps: several in a few dozen."""
+    monkeypatch.setattr(schedule, "MIN_INTERVAL", 4)
+
+
+@pytest.mark.parametrize("method", [PLAIN_VASTGAUSSIAN, train_dogs], ids=["vastgaussian", "dogs"])
+def test_one_block_is_3dgs_growth_included(capture, tmp_path, often, method):
+    published = scale_schedule(30, Gs3dConfig(background="mean"))
+    scene = GaussianBlocksConfig(blocks=1, iterations=30, scene=published)
+    one = train_scene(capture, scene, StageFolder(tmp_path / "one"), method, QUIET)
+    alone = train_gs3d(capture, published, tmp_path / "alone", QUIET)
+    assert len(alone.gaussians) > 1.2 * len(capture.points)
     assert bits(one.gaussians) == bits(alone.gaussians)
     assert one.background == alone.background
+    assert StageFolder(tmp_path / "one").status().iteration == 30
+
+
+@pytest.mark.parametrize(
+    "method", [PLAIN_VASTGAUSSIAN, train_citygaussian, train_dogs], ids=["vastgaussian", "citygaussian", "dogs"]
+)
+def test_blocks_grow_to_their_share_of_the_scenes_limit(capture, tmp_path, often, monkeypatch, method):
+    """A block's share is that of its cell; what else it holds comes on top. All ask for growth, none goes."""
+    most, limits, begun = len(capture.points) + 20, list[int](), list[int]()
+    configure = BlockScene.block_config
+
+    def noting(scene: BlockScene, own: int, total: int, held: int) -> Gs3dConfig:
+        limits.append(most * own // total + held - own)
+        begun.append(held)
+        config = configure(scene, own, total, held)
+        eager = replace(config.density, threshold=1e-9, prune_opacity=0.0, prune_size=1e9)
+        return replace(config, density=eager)
+
+    monkeypatch.setattr(BlockScene, "block_config", noting)
+    published = scale_schedule(4, Gs3dConfig(background="mean"), most)
+    scene = GaussianBlocksConfig(blocks=2, iterations=30, scene=published)
+    train_scene(capture, scene, StageFolder(tmp_path), method, QUIET)
+    grown = [len(GaussianModel.load(folder / "model.safetensors").gaussians) for folder in blocks_of(tmp_path)]
+    assert len(grown) == 2
+    assert grown == limits
+    assert all(after > before for after, before in zip(grown, begun, strict=True))
 
 
 def test_citygaussian_goes_on_with_the_whole_scene_and_keeps_cells(capture, tmp_path):

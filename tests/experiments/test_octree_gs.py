@@ -137,6 +137,22 @@ def test_the_volume_weight_is_of_the_unit_of_the_capture(capture):
         assert weight == pytest.approx(0.01 / scale**3)
 
 
+@pytest.mark.parametrize("config", [SCAFFOLD, OCTREE], ids=["scaffold-gs", "octree-gs"])
+@pytest.mark.parametrize("scale", [0.25, 2.0])
+def test_a_decision_bounds_sizes_in_the_unit_of_the_capture(capture, config, scale):
+    """The three that Gaussians multiply; those that offsets multiply stay."""
+    place = replace(capture, ground=replace(capture.ground, scale=scale))
+    with open_training_images(place, config.training, 10**8) as images:
+        octree, problem = problem_of(place, config, images)
+    state = started(place, problem, octree)
+    state.anchors.log_scales.fill_(3.0)
+    assert problem.grow is not None
+    problem.grow(state, problem)
+    offsets, sizes = state.anchors.log_scales.split(3, dim=1)
+    torch.testing.assert_close(sizes.exp(), torch.full_like(sizes, scale * np.exp(0.05)))
+    assert torch.equal(offsets, torch.full_like(offsets, 3.0))
+
+
 def test_levels_follow_the_distances_of_the_cameras(capture):
     cameras = [view.camera for view in capture.train_views]
     octree = fit_octree(capture.points, cameras, octree_config(100))

@@ -25,7 +25,7 @@ class DensityConfig:
     start: int = 500
     """The first decision comes after so many iterations (program)."""
     until: float = 0.5
-    """Share of the iterations after which there are no more decisions (program: 15 000 of 30 000)."""
+    """Decisions come before this share of the iterations is made (program: before the 15 000th of 30 000)."""
     threshold: float = 2e-4
     """tau_pos: mean norm of dL/d(mean) in NDC units from which a Gaussian is cloned or split (section 5.2)."""
     dense: float = 0.01
@@ -37,7 +37,7 @@ class DensityConfig:
     prune_size: float = 0.1
     """Gaussians larger than this share of the extent go, once opacities were reset (section 5.2; value: program)."""
     reset_interval: int = 3000
-    """N: iterations between two resets of all opacities, before the last decision (section 5.2; program)."""
+    """N: iterations between two resets of all opacities, as long as there are decisions (section 5.2; program)."""
     reset_opacity: float = 0.01
     """Opacities are at most this after a reset (section 5.2: "close to zero"; value: program)."""
     max_gaussians: int = 0

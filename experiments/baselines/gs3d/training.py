@@ -249,7 +249,7 @@ def gs3d_train_step(state: Gs3dState, stage: Gs3dProblem) -> Gs3dStepReport:
     state.iteration += 1
 
     report = Gs3dStepReport(value, float(photometric.l1), float(photometric.ssim), len(rows))
-    if state.iteration <= config.density.until * config.iterations:
+    if state.iteration < config.density.until * config.iterations:  # not at the end itself (program)
         _accumulate_gradients(state, rows, of_means_px, camera)
         report = replace(report, **_densify(state, stage))
     _smooth(state, value, psnr)
@@ -326,8 +326,7 @@ def _densify(state: Gs3dState, stage: Gs3dProblem) -> dict[str, Any]:
         )  # fmt: skip
         _apply(state, change.added, change.kept)
         counts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
-    # Not by the last decision (program): what is faint then would stay, and nothing would prune it.
-    if done % config.reset_interval == 0 and done < config.until * stage.config.iterations:
+    if done % config.reset_interval == 0:
         state.gaussians.opacity_logits.copy_(cap_opacity_logits(state.gaussians.opacity_logits, config.reset_opacity))
         state.moments.first["opacity_logits"].zero_()
         state.moments.second["opacity_logits"].zero_()

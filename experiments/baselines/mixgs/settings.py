@@ -30,7 +30,8 @@ class MixConfig:
     min_opacity: float = 0.05
     #: Rates of mixed training, those of means times the extent; offsets have the first rate of means throughout.
     rates: Gs3dLearningRates = field(default_factory=lambda: Gs3dLearningRates(means=(6.4e-6, 6.4e-8)))
-    #: Rates of the hash tables and of the decoder, first and last (program: 600 and 80 times those of means).
+    #: Rates of the hash tables and of the decoder, first and last (program: 600 times those of means; of the decoder
+    #: the first is 80 times that of means, the last is theirs).
     table_rate: tuple[float, float] = (3.84e-3, 3.84e-5)
     decoder_rate: tuple[float, float] = (5.12e-4, 6.4e-8)
     #: Hash tables: levels, features of a level, coarsest and finest grid; the decoder's width.

@@ -3,8 +3,9 @@
     python -m experiments.reports.analyses.paper_schedule DATA WORK             # three values of tau, eight blocks
     python -m experiments.reports.analyses.paper_schedule DATA WORK --crossed [--seed 1]   # cut x compensation, four blocks
 
-One coarse model of seneca is trained; each row cuts a copy of it into blocks, trains, merges and measures them. Rows are
-kept in WORK/schedule.jsonl: the same command continues. Test photographs are left out.
+One coarse model of seneca is trained for each seed; each row cuts a copy of it into blocks, trains, merges and measures
+them. Rows are kept in WORK/schedule.jsonl with their seed: the same command continues, and seeds may share WORK. Test
+photographs are left out.
 """
 
 from __future__ import annotations
@@ -74,17 +75,18 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def main(data: Path, work: Path, wanted: dict[str, Changes], seed: int) -> list[dict[str, Any]]:
-    """The rows of these names; those that are there are kept."""
+    """The rows of these names and this seed; those that are there are kept."""
     work.mkdir(parents=True, exist_ok=True)
-    file, coarse = work / "schedule.jsonl", RunFolder(work / "coarse")
-    rows = {row["row"]: row for row in map(json.loads, file.read_text().splitlines())} if file.exists() else {}
+    file, coarse = work / "schedule.jsonl", RunFolder(work / f"coarse-{seed}")
+    done = map(json.loads, file.read_text().splitlines()) if file.exists() else ()
+    rows = {row["row"]: row for row in done if row.get("seed") == seed}
     if wanted.keys() - rows:
         call("train-coarse", data / "seneca", *COARSE, "--seed", str(seed), "--output", coarse.path, "--quiet")
         call("visibility", coarse.path, "--quiet")
         call("eval", coarse.path, "--model", "coarse", "--quiet")
     for name, changes in wanted.items():
         if name not in rows:
-            rows[name] = write_row(file, row_of(coarse, work / "row", name, changes))
+            rows[name] = write_row(file, {"seed": seed} | row_of(coarse, work / "row", name, changes))
     return [rows[name] for name in wanted]
 
 
