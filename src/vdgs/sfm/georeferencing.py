@@ -18,6 +18,7 @@ from vdgs.sfm import gcp_adjustment, georegistration
 from vdgs.sfm.bending import bend_to_positions
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -53,6 +54,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
 
     Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
     """
+    drop_unseen_observations(model)
     control = prepared.gcps
     doubtful = frozenset[str]()
     placed: Georegistration | AlignmentFailure

@@ -23,6 +23,7 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
@@ -90,7 +91,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         found=len(collection.images) + len(collection.excluded), registered=len(images),
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
-        reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
+        reprojection_px=mean_reprojection_error(model), georeferenced=georeferenced,
         altitude_reference=_altitudes(plan) if placed and placed.is_georeferenced else "", origin=result.found.origin,
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
         focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
