@@ -67,3 +67,38 @@ def test_a_slope_is_told_from_a_look_aside_by_cameras_that_turn():
     assert np.degrees(np.arccos(up[2])) < deviation <= 3
     up, deviation, _ = up_by_views(places, one_way, ground)
     assert 5 < deviation
+
+
+def along_a_slope(climb_deg: float = 22.0) -> np.ndarray:
+    """Four strips of five photographs that keep their height over a hillside."""
+    x, y = np.meshgrid(np.arange(5) * 12.0, np.arange(4) * 14.0)
+    return np.stack([x.ravel(), y.ravel(), 500 + np.tan(np.radians(climb_deg)) * y.ravel()], axis=1)
+
+
+def views(off_deg: float, deviation_deg: float = 3.0) -> Up:
+    """Up that is off by an angle, to the north."""
+    off = np.radians(off_deg)
+    return Up(np.array([0, np.sin(off), np.cos(off)]), deviation_deg, "the views")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_heights_over_the_ground_are_not_taken_for_altitudes(noise, seed):
+    rng = np.random.default_rng(seed)
+    places = along_a_slope()
+    recorded = places + rng.normal(0, 0.5, places.shape)
+    recorded[:, 2] = 45 + rng.normal(0, noise, len(places))
+    fit = fit_of(places, recorded, views(-2))
+    assert fit.altitude == "none"
+    assert tilt_deg(fit) < fit.level_error_deg < 10
+    assert abs(fit.similarity.scale - 1) < 2 * fit.scale_error
+
+
+@pytest.mark.parametrize("climb_deg", [0.0, 5.0, 22.0])
+@pytest.mark.parametrize("off_deg", [-4.0, 0.0, 4.0])
+def test_altitudes_of_a_receiver_are_used_along_a_slope_and_over_level_ground(climb_deg, off_deg):
+    rng = np.random.default_rng(2)
+    places = along_a_slope(climb_deg)
+    fit = fit_of(places, places + rng.normal(0, 0.5, places.shape), views(off_deg))
+    assert fit.altitude == "used"
+    assert tilt_deg(fit) < 3

@@ -1,5 +1,5 @@
-"""Which altitudes of positions are believed: not those of exactly 0, which programs write that know none, and not those
-in feet that are said to be metres."""
+"""Which altitudes of positions are believed: not those of exactly 0, which programs write that know none, not heights
+over the ground, and not those in feet that are said to be metres."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ SAME_RELIEF = 0.1
 #: Cameras whose heights differ by more than this (metres) tell altitudes in feet from those in metres.
 LEAST_RELIEF_M = 2.5
 
+#: Altitudes are heights over the ground where they spread by less than this share of what the photographs' heights do,
+#: and lie across those by so many times what up may be off by, and so many degrees (choice).
+ALIKE_SHARE, ACROSS_SIGMAS, ACROSS_DEG = 0.25, 3.0, 6.0
+
 
 def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
     """Which of the `known` positions [n] bool are used, and whether their altitudes [n] are: the positions with an
@@ -33,6 +37,16 @@ def without_zero_altitudes(geodetic: np.ndarray, known: np.ndarray) -> np.ndarra
     if not zero.any() or (others.any() and abs(np.median(geodetic[others, 2])) < FAR_FROM_ZERO_M):
         return geodetic
     return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
+
+
+def are_over_ground(altitudes: np.ndarray, placed: np.ndarray, tilt_deg: float) -> bool:
+    """Whether altitudes [n] that are nearly one for all are heights over the ground, which a flight along a slope keeps:
+    by places [n, 3] that do not depend on altitudes, whose up may be off by `tilt_deg` (one standard deviation)."""
+    plane, missing = placed[:, :2] - placed[:, :2].mean(axis=0), placed[:, 2] - altitudes
+    slope = np.linalg.lstsq(plane, missing - missing.mean(), rcond=None)[0]
+    across = np.degrees(np.arctan(np.linalg.norm(slope)))
+    alike = np.std(altitudes) < ALIKE_SHARE * np.std(placed[:, 2])
+    return bool(alike and across > max(ACROSS_DEG, ACROSS_SIGMAS * tilt_deg))
 
 
 def wrong_unit(altitudes: np.ndarray, heights: np.ndarray) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
+from vdgs.captures.gps_altitudes import are_over_ground
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M, fit_plane, in_plane
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
 
@@ -113,8 +114,13 @@ class Problem:
 
 
 def fit_positions(problem: Problem) -> PositionFit:
-    """The likeliest similarity of cameras that are not mirrored; needs three positions."""
+    """The likeliest similarity of cameras that are not mirrored; needs three positions. Altitudes that are heights over
+    the ground count as none."""
     starts = [_upright_start(problem)]
+    if problem.has_altitudes and problem.up.sure and len(problem.centers) >= ENOUGH_TO_DOUBT:
+        plane = _settle(replace(problem, has_altitudes=False), starts[0], "unused")
+        if are_over_ground(problem.targets[:, 2], plane.placed, problem.up.deviation_deg):
+            return plane
     if problem.has_altitudes and not is_collinear(problem.centers):
         starts.append(fit_similarity_robust(problem.centers, problem.targets, 100)[0])
     models = ["used", "unused"] if problem.has_altitudes else ["unused"]

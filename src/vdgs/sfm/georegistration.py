@@ -120,7 +120,9 @@ def georegister(
         )
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
-    fit, barometer = _best_fit(levelled, taken)
+    fit, barometer, over_ground = _best_fit(levelled, taken)
+    if over_ground:
+        positions = replace(positions, has_altitudes=False)
     elsewhere = _elsewhere(fit, far)
     if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
@@ -133,7 +135,8 @@ def georegister(
     how = _method(fit, barometer, is_nearly_collinear(targets, positions.gps_std[rows]), positions.source, up.how)
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
-    notes += _of_altitudes(fit, barometer) + _of_north(fit.similarity, images, taken)
+    notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
+    notes += _of_north(fit.similarity, images, taken)
     return Georegistration(
         similarity=fit.similarity,
         method=how,
@@ -257,21 +260,32 @@ def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
     ]
 
 
-def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[PositionFit, bool]:
-    """The fit, and whether its heights are the barometer's: over the take-off, where altitudes drift against them."""
+def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[PositionFit, bool, bool]:
+    """The fit; whether its heights are the barometer's: over the take-off, where altitudes drift against them; and
+    whether what is recorded as altitudes are heights over the ground, and counts as none."""
     fit = fit_positions(problem)
+    over_ground = problem.has_altitudes and fit.altitude == "none"
+    problem = replace(problem, has_altitudes=problem.has_altitudes and not over_ground)
     relative = np.array([np.nan if photo.relative_altitude is None else photo.relative_altitude for photo in taken])
     if fit.altitude == "used" or not np.isfinite(relative).all() or np.ptp(relative) == 0:
-        return fit, False
+        return fit, False, over_ground
     targets = problem.targets.copy()
     targets[:, 2] = relative + np.median(targets[:, 2] - relative)
     steady = fit_positions(replace(problem, targets=targets, has_altitudes=True))
     if steady.altitude != "used" or (problem.has_altitudes and steady.score >= fit.score):
-        return fit, False
+        return fit, False, over_ground
     if problem.has_altitudes:  # they alone say how high the take-off is, with all of their drift
         across, up = steady.place_error_m
         steady = replace(steady, place_error_m=(across, max(up, fit.place_error_m[1])), drift_m=fit.drift_m)
-    return steady, True
+    return steady, True, over_ground
+
+
+def _over_ground(fit: PositionFit) -> str:
+    return (
+        "the recorded altitudes are nearly one for all photographs, which themselves show a flight that rises and falls "
+        f"by {two_digits(float(np.ptp(fit.placed[:, 2])))} m as along a slope: heights over the ground? They are not "
+        "used, and heights above the sea are not known."
+    )
 
 
 def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
