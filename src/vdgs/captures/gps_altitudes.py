@@ -40,8 +40,8 @@ def without_zero_altitudes(geodetic: np.ndarray, known: np.ndarray) -> np.ndarra
 
 
 def are_over_ground(altitudes: np.ndarray, placed: np.ndarray, tilt_deg: float) -> bool:
-    """Whether altitudes [n] that are nearly one for all are heights over the ground, which a flight along a slope keeps:
-    by places [n, 3] that do not depend on altitudes, whose up may be off by `tilt_deg` (one standard deviation)."""
+    """Whether altitudes [n], nearly one for all, are heights over the ground, which a flight along a slope keeps: by
+    places [n, 3] that do not depend on altitudes, whose up may be off by `tilt_deg` (one standard deviation)."""
     plane, missing = placed[:, :2] - placed[:, :2].mean(axis=0), placed[:, 2] - altitudes
     slope = np.linalg.lstsq(plane, missing - missing.mean(), rcond=None)[0]
     across = np.degrees(np.arctan(np.linalg.norm(slope)))

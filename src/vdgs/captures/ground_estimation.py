@@ -188,7 +188,8 @@ def _fit_table(problem: Problem, altitudes: np.ndarray, file: Path, warnings: li
     """The fit of a table's positions with what its altitudes [n] are good for, which it says where they do not tell up.
 
     Altitudes that are all one number, where the cameras' heights differ, are those of a program that knew none, or over
-    the ground: they do not even say how high the place lies. Raises CaptureError where the cameras tell that altitudes are in feet.
+    the ground: they do not even say how high the place lies. Raises CaptureError where the cameras tell that altitudes
+    are in feet.
     """
     fit = fit_positions(problem)
     heights = fit.placed[:, 2]

@@ -31,8 +31,8 @@ ROLL_PRIOR = 0.002
 LOOKS_DOWN, AGREE_DEG = 0.85, 12.0
 #: And below this cosine between both the shape of the flight does not say what up is (choice).
 MIN_DOWN_COSINE = 0.5
-#: Below this ratio of singular values of the mean rotation cameras turned about one axis by enough to tell how they hang
-#: from how the world lies (choice).
+#: Below this ratio of singular values of the mean rotation cameras turned about one axis by enough to tell how they
+#: hang from how the world lies (choice).
 TURNED = 0.75
 #: Standard deviations of up in degrees: by views that look down, by cameras that are held level, where in doubt.
 VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0

@@ -17,6 +17,7 @@ from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.recorded_headings import checked_by_headings
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
 
@@ -34,8 +35,6 @@ LOOKED_UP = (
 )
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
-#: Recorded headings count from so many on that agree so well (mean of unit vectors); the other way round is so far.
-ENOUGH_HEADINGS, ALIKE, OTHER_WAY_DEG = 5, 0.95, 150.0
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
@@ -127,6 +126,7 @@ def georegister(
     if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
+    fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
@@ -136,7 +136,7 @@ def georegister(
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
-    notes += _of_north(fit.similarity, images, taken)
+    notes += of_north
     return Georegistration(
         similarity=fit.similarity,
         method=how,
@@ -282,9 +282,9 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
 
 def _over_ground(fit: PositionFit) -> str:
     return (
-        "the recorded altitudes are nearly one for all photographs, which themselves show a flight that rises and falls "
-        f"by {two_digits(float(np.ptp(fit.placed[:, 2])))} m as along a slope: heights over the ground? They are not "
-        "used, and heights above the sea are not known."
+        "the recorded altitudes are nearly one for all photographs, which themselves show a flight that rises and "
+        f"falls by {two_digits(float(np.ptp(fit.placed[:, 2])))} m as along a slope: heights over the ground? They are "
+        "not used, and heights above the sea are not known."
     )
 
 
@@ -304,30 +304,6 @@ def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
             f"north and up are found without them; {good}"
         ]
     return []
-
-
-def _of_north(
-    similarity: Similarity, images: Mapping[str, pycolmap.Image], taken: Sequence[ImageMetadata]
-) -> list[str]:
-    """A note where all recorded headings say that the scene lies the other way round: both hemispheres lost."""
-    seen = [photo for photo in taken if photo.attitude is not None]
-    turns = np.array(
-        [
-            similarity.rotation @ _rotation(images[photo.name]).T @ photo.attitude.camera_from_enu
-            for photo in seen
-            if photo.attitude is not None
-        ]
-    ).reshape(-1, 3, 3)
-    if len(turns) < ENOUGH_HEADINGS:
-        return []
-    mean = np.mean(np.exp(1j * np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])))
-    away = abs(float(np.degrees(np.angle(mean))))
-    if abs(mean) < ALIKE or away < OTHER_WAY_DEG:
-        return []
-    return [
-        f"north is turned by {away:.0f}° from what the drone recorded. Are both hemispheres (S and W) missing from the "
-        "positions?"
-    ]
 
 
 def _other_readings(targets: np.ndarray, origin: tuple[float, float, float]) -> dict[str, np.ndarray]:
