@@ -164,3 +164,15 @@ def test_headings_that_agree_leave_an_orbit_as_it_is():
 
 def test_headings_the_other_way_round_ask_for_both_hemispheres():
     assert "hemispheres" in checked(*orbit(), 0.0, 180.0)[2][0]
+
+
+@pytest.mark.parametrize("step_m", [-3.0, -2.0, 0.0, 2.0, 3.0])
+def test_level_of_two_strips_holds_a_step_between_their_altitudes(step_m):
+    x, y = np.meshgrid(np.arange(10) * 9.0, [-8.0, 8.0])
+    places = np.stack([x.ravel(), y.ravel(), np.full(20, 45.0)], axis=1)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
+        recorded[10:, 2] += step_m
+        fit = fit_of(places, recorded, views(1.0))
+        assert tilt_deg(fit) < fit.level_error_deg < 12
