@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.up_axis import up_by_views
+from vdgs.sfm.georegistration import _checked_on_a_line
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.recorded_headings import checked_by_headings
 
@@ -176,3 +178,26 @@ def test_level_of_two_strips_holds_a_step_between_their_altitudes(step_m):
         recorded[10:, 2] += step_m
         fit = fit_of(places, recorded, views(1.0))
         assert tilt_deg(fit) < fit.level_error_deg < 12
+
+
+@pytest.mark.parametrize(("factor", "said", "off"), [(3.2808, "feet", 1140.0), (-1.0, "wrong sign", 1000.0)])
+def test_altitudes_in_feet_or_of_the_wrong_sign_are_named_by_what_they_differ_by(factor, said, off):
+    rng = np.random.default_rng(0)
+    heights = np.r_[np.full(10, 500.0), np.full(10, 517.0)] + rng.normal(0, 0.5, 20)
+    what, apart = wrong_reading(factor * heights + rng.normal(0, 0.8, 20), heights - 470)
+    assert said in what
+    assert apart == pytest.approx(off, rel=0.05)
+    assert wrong_reading(heights + np.repeat([0, 12.0], 10), heights) == ("", 0.0)
+    assert wrong_reading(factor * np.full(20, 500.0), np.full(20, 30.0)) == ("", 0.0)
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 8.0, 17.0])
+def test_heights_along_one_line_are_no_better_than_a_drift_that_nothing_tells(drift_m):
+    rng = np.random.default_rng(1)
+    places = np.stack([8.0 * np.arange(14), np.zeros(14), np.full(14, 45.0)], axis=1)
+    recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
+    recorded[:, 2] += np.linspace(0, drift_m, 14)
+    problem = Problem(centers=places, targets=recorded, times=np.linspace(0, 1, 14), up=views(0, 6.0))
+    fit, notes = _checked_on_a_line(fit_positions(problem), problem)
+    assert abs(float((fit.placed - places)[:, 2].mean())) < fit.place_error_m[1] < 2 + drift_m
+    assert bool(notes) == (drift_m > 0)

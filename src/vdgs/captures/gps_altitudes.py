@@ -52,14 +52,27 @@ def are_over_ground(altitudes: np.ndarray, placed: np.ndarray, tilt_deg: float) 
 def wrong_unit(altitudes: np.ndarray, heights: np.ndarray) -> str:
     """The unit of altitudes [n] that are taken for another: feet where they differ as `heights` [n] in feet do, over
     any zero, metres the other way around; empty where neither holds, or heights do not differ enough to tell."""
-    if np.ptp(heights) < LEAST_RELIEF_M:
-        return ""
-    altitudes, heights = altitudes - np.median(altitudes), heights - np.median(heights)
-    size = float(np.median(np.abs(heights)))
     for factor, unit in ((1 / FOOT_M, "feet"), (FOOT_M, "metres")):
-        if size > 0 and float(np.median(np.abs(altitudes / factor - heights))) < SAME_RELIEF * size:
+        if _differ_times(factor, altitudes, heights):
             return unit
     return ""
+
+
+def wrong_reading(altitudes: np.ndarray, heights: np.ndarray) -> tuple[str, float]:
+    """What altitudes [n] that do not differ as `heights` [n] do are, in words, and how far that puts them off, in
+    metres; empty and 0 where nothing is known that they are."""
+    for factor, what in ((1 / FOOT_M, "in feet"), (-1.0, "of the wrong sign")):
+        if _differ_times(factor, altitudes, heights):
+            return what, float(abs(np.median(altitudes) * (1 - 1 / factor)))
+    return "", 0.0
+
+
+def _differ_times(factor: float, altitudes: np.ndarray, heights: np.ndarray) -> bool:
+    """Whether altitudes [n] differ so many times as much as heights [n], whose differences are large enough to tell."""
+    altitudes, heights = altitudes - np.median(altitudes), heights - np.median(heights)
+    size = float(np.median(np.abs(heights)))
+    off = float(np.median(np.abs(altitudes / factor - heights)))
+    return np.ptp(heights) >= LEAST_RELIEF_M and size > 0 and off < SAME_RELIEF * size
 
 
 def refuse_unit(unit: str, whose: str, file: Path) -> None:

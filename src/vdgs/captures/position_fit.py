@@ -197,7 +197,9 @@ def _settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     scale, north, level, place = _errors(
         normal, wandering, int(inliers.sum()), gps_std, state.drift, model, problem.stated
     )
-    level = _with_unseen_step(level, problem, state, gains[:, np.argsort(problem.times[inliers], kind="stable")], gps_std)
+    level = _with_unseen_step(
+        level, problem, state, gains[:, np.argsort(problem.times[inliers], kind="stable")], gps_std
+    )
     return PositionFit(
         similarity=similarity, inliers=inliers, residuals=placed - problem.targets, placed=placed,
         gps_std=gps_std, altitude=model if problem.has_altitudes else "none",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
@@ -40,6 +41,8 @@ MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
 #: distance is found of about so many photographs.
 MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
+#: Altitudes along a line that change so many times their error against what is known of up are worth a note (choice).
+MUCH_DRIFT = 4.0
 ADVICE_WRITE_GPS = (
     "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
     "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
@@ -126,17 +129,20 @@ def georegister(
     if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
+    fit, of_reading = _checked_reading(fit, problem, positions, offsets)
+    on_a_line = is_nearly_collinear(targets, positions.gps_std[rows])
+    fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
     fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
     notes += [f"{refused}; used all the same, as asked for."] if refused else []
     notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
-    how = _method(fit, barometer, is_nearly_collinear(targets, positions.gps_std[rows]), positions.source, up.how)
+    how = _method(fit, barometer, on_a_line, positions.source, up.how)
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
-    notes += of_north
+    notes += of_reading + of_line + of_north
     return Georegistration(
         similarity=fit.similarity,
         method=how,
@@ -278,6 +284,42 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
         across, up = steady.place_error_m
         steady = replace(steady, place_error_m=(across, max(up, fit.place_error_m[1])), drift_m=fit.drift_m)
     return steady, True, over_ground
+
+
+def _checked_reading(
+    fit: PositionFit, problem: Problem, positions: GpsPriors, offsets: AltitudeOffsets | None
+) -> tuple[PositionFit, list[str]]:
+    """The fit with altitudes as uncertain as they are where they differ as those in feet or of the wrong sign do from
+    heights by the photographs, and a note."""
+    if not positions.has_altitudes or (fit.altitude == "used" and offsets is None):
+        return fit, []
+    what, off = wrong_reading(problem.targets[:, 2] + positions.origin[2], fit.placed[:, 2])
+    if not what:
+        return fit, []
+    across, up = fit.place_error_m
+    note = (
+        f"the altitudes ({positions.source}) differ between the photographs as altitudes do that are {what}: heights "
+        f"above the sea may be off by {two_digits(off)} m. A table of positions (--gps) mends it."
+    )
+    return replace(fit, place_error_m=(across, up + off)), [note]
+
+
+def _checked_on_a_line(fit: PositionFit, problem: Problem) -> tuple[PositionFit, list[str]]:
+    """The fit of positions along one line, where nothing tells a drift of altitudes from a climb but what is known of
+    up without positions: heights are no better than the two differ. A note where that is much."""
+    if fit.altitude != "used" or problem.stated is not None or not problem.up.sure:
+        return fit, []
+    apart = fit.placed[:, 2] - fit.placed @ fit.similarity.rotation @ problem.up.direction
+    drift, (across, up) = float(np.ptp(apart[fit.inliers])), fit.place_error_m
+    found = replace(fit, place_error_m=(across, float(np.hypot(up, drift / 2))))
+    if drift < MUCH_DRIFT * up:
+        return found, []
+    note = (
+        f"along the one line of the flight the recorded altitudes change by {two_digits(drift)} m against what "
+        f"{problem.up.how} say: a drift, or up is off. Heights above the sea are only good to "
+        f"±{two_digits(found.place_error_m[1])} m."
+    )
+    return found, [note]
 
 
 def _over_ground(fit: PositionFit) -> str:
