@@ -311,7 +311,7 @@ def _checked_on_a_line(fit: PositionFit, problem: Problem) -> tuple[PositionFit,
         return fit, []
     apart = fit.placed[:, 2] - fit.placed @ fit.similarity.rotation @ problem.up.direction
     drift, (across, up) = float(np.ptp(apart[fit.inliers])), fit.place_error_m
-    found = replace(fit, place_error_m=(across, float(np.hypot(up, drift / 2))))
+    found = replace(fit, place_error_m=(across, up + drift / 2))
     if drift < MUCH_DRIFT * up:
         return found, []
     note = (
