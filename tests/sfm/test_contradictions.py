@@ -177,7 +177,7 @@ def test_level_of_two_strips_holds_a_step_between_their_altitudes(step_m):
         recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
         recorded[10:, 2] += step_m
         fit = fit_of(places, recorded, views(1.0))
-        assert tilt_deg(fit) < fit.level_error_deg < 12
+        assert tilt_deg(fit) < fit.level_error_deg < 20
 
 
 @pytest.mark.parametrize(("factor", "said", "off"), [(3.2808, "feet", 1140.0), (-1.0, "wrong sign", 1000.0)])
