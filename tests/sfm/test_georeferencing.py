@@ -130,7 +130,7 @@ def test_heights_of_a_barometer_are_as_high_above_the_sea_as_altitudes_tell(drif
         recorded = places + rng.normal(0, 1.0, places.shape)
         recorded[:, 2] += drift_m * (time if shape == "line" else np.sin(np.pi * time))
         taken = [SimpleNamespace(relative_altitude=height) for height in places[:, 2] + rng.normal(0, 0.3, len(places))]
-        fit, barometer = georegistration._best_fit(problem_of(places, recorded, seed)[0], taken)
+        fit, barometer, _ = georegistration._best_fit(problem_of(places, recorded, seed)[0], taken)
         off = abs(fit.placed.mean(axis=0)[2] - places[:, 2].mean())
         assert barometer
         assert off <= fit.place_error_m[1] < 2 * drift_m

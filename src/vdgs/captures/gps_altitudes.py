@@ -1,5 +1,5 @@
-"""Which altitudes of positions are believed: not those of exactly 0, which programs write that know none, and not those
-in feet that are said to be metres."""
+"""Which altitudes of positions are believed: not those of exactly 0, which programs write that know none, not heights
+over the ground, and not those in feet that are said to be metres."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ FAR_FROM_ZERO_M = 30.0
 SAME_RELIEF = 0.1
 #: Cameras whose heights differ by more than this (metres) tell altitudes in feet from those in metres.
 LEAST_RELIEF_M = 2.5
+
+#: Altitudes are heights over the ground where they spread by less than this share of what the photographs' heights do,
+#: and lie across those by so many times what up may be off by, and so many degrees (choice).
+ALIKE_SHARE, ACROSS_SIGMAS, ACROSS_DEG = 0.25, 3.0, 6.0
 
 
 def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -35,17 +39,40 @@ def without_zero_altitudes(geodetic: np.ndarray, known: np.ndarray) -> np.ndarra
     return np.where(zero[:, None] & [False, False, True], np.nan, geodetic)
 
 
+def are_over_ground(altitudes: np.ndarray, placed: np.ndarray, tilt_deg: float) -> bool:
+    """Whether altitudes [n], nearly one for all, are heights over the ground, which a flight along a slope keeps: by
+    places [n, 3] that do not depend on altitudes, whose up may be off by `tilt_deg` (one standard deviation)."""
+    plane, missing = placed[:, :2] - placed[:, :2].mean(axis=0), placed[:, 2] - altitudes
+    slope = np.linalg.lstsq(plane, missing - missing.mean(), rcond=None)[0]
+    across = np.degrees(np.arctan(np.linalg.norm(slope)))
+    alike = np.std(altitudes) < ALIKE_SHARE * np.std(placed[:, 2])
+    return bool(alike and across > max(ACROSS_DEG, ACROSS_SIGMAS * tilt_deg))
+
+
 def wrong_unit(altitudes: np.ndarray, heights: np.ndarray) -> str:
     """The unit of altitudes [n] that are taken for another: feet where they differ as `heights` [n] in feet do, over
     any zero, metres the other way around; empty where neither holds, or heights do not differ enough to tell."""
-    if np.ptp(heights) < LEAST_RELIEF_M:
-        return ""
-    altitudes, heights = altitudes - np.median(altitudes), heights - np.median(heights)
-    size = float(np.median(np.abs(heights)))
     for factor, unit in ((1 / FOOT_M, "feet"), (FOOT_M, "metres")):
-        if size > 0 and float(np.median(np.abs(altitudes / factor - heights))) < SAME_RELIEF * size:
+        if _differ_times(factor, altitudes, heights):
             return unit
     return ""
+
+
+def wrong_reading(altitudes: np.ndarray, heights: np.ndarray) -> tuple[str, float]:
+    """What altitudes [n] that do not differ as `heights` [n] do are, in words, and how far that puts them off, in
+    metres; empty and 0 where nothing is known that they are."""
+    for factor, what in ((1 / FOOT_M, "in feet"), (-1.0, "of the wrong sign")):
+        if _differ_times(factor, altitudes, heights):
+            return what, float(abs(np.median(altitudes) * (1 - 1 / factor)))
+    return "", 0.0
+
+
+def _differ_times(factor: float, altitudes: np.ndarray, heights: np.ndarray) -> bool:
+    """Whether altitudes [n] differ so many times as much as heights [n], whose differences are large enough to tell."""
+    altitudes, heights = altitudes - np.median(altitudes), heights - np.median(heights)
+    size = float(np.median(np.abs(heights)))
+    off = float(np.median(np.abs(altitudes / factor - heights)))
+    return np.ptp(heights) >= LEAST_RELIEF_M and size > 0 and off < SAME_RELIEF * size
 
 
 def refuse_unit(unit: str, whose: str, file: Path) -> None:

@@ -187,19 +187,21 @@ def _georeferenced(scene: _Scene, georef: Georef, name: str, warnings: list[str]
 def _fit_table(problem: Problem, altitudes: np.ndarray, file: Path, warnings: list[str]) -> PositionFit:
     """The fit of a table's positions with what its altitudes [n] are good for, which it says where they do not tell up.
 
-    Altitudes that are all one number, where the cameras' heights differ, are those of a program that knew none: they do
-    not even say how high the place lies. Raises CaptureError where the cameras tell that altitudes are in feet.
+    Altitudes that are all one number, where the cameras' heights differ, are those of a program that knew none, or over
+    the ground: they do not even say how high the place lies. Raises CaptureError where the cameras tell that altitudes
+    are in feet.
     """
     fit = fit_positions(problem)
+    heights = fit.placed[:, 2]
+    if problem.has_altitudes and (fit.altitude == "none" or (fit.altitude != "used" and not np.ptp(altitudes))):
+        about = "all" if not np.ptp(altitudes) else "all about"
+        warnings.append(
+            f"{file.name}: its altitudes are {about} {np.median(altitudes):g} m, but the cameras' heights differ by "
+            f"{np.ptp(heights):.0f} m: left out; up is by the views, heights count from the median point."
+        )
+        return fit_positions(replace(problem, has_altitudes=False))
     if fit.altitude in ("unused", "drifts"):
-        heights = fit.placed[:, 2]
         refuse_unit(wrong_unit(altitudes, heights), "the cameras", file)
-        if not np.ptp(altitudes):
-            warnings.append(
-                f"{file.name}: its altitudes are all {altitudes[0]:g} m, but the cameras' heights differ by "
-                f"{np.ptp(heights):.0f} m: left out; up is by the views, heights count from the median point."
-            )
-            return fit_positions(replace(problem, has_altitudes=False))
         warnings.append(f"{file.name}: its altitudes drift or are of no use, and were left out; up is by the views.")
     elif fit.altitude == "none":
         warnings.append(f"{file.name}: it has no altitudes; up is by the views, heights count from the median point.")

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
+from vdgs.captures.gps_altitudes import are_over_ground
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M, fit_plane, in_plane
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
 
@@ -28,6 +29,10 @@ USUAL_M = (1.0, 2.0)
 DRIFT_COSTS, UNUSED_COSTS = 4.0, 8.0
 #: Where the receiver states its accuracy, so many times more; it is believed up to so many times what it states.
 STATED_TIMES, BELIEVED = 5.0, 3.0
+#: Altitudes of a receiver that states no accuracy may step once in a flight, as with another battery, by so many times
+#: what they differ by from photograph to photograph, and by so many metres (one standard deviation; choice), or so many
+#: times what positions differ by across where that is less: of a better receiver.
+UNSEEN_STEP, UNSEEN_STEP_M, UNSEEN_STEP_ACROSS = 1.5, 1.75, 4.0
 #: The weight of altitudes that are not used: their mean alone counts.
 UNUSED_TIMES = 1e5
 #: Residuals that follow each other alike count as if there were fewer of them, by this factor at most.
@@ -113,8 +118,13 @@ class Problem:
 
 
 def fit_positions(problem: Problem) -> PositionFit:
-    """The likeliest similarity of cameras that are not mirrored; needs three positions."""
+    """The likeliest similarity of cameras that are not mirrored; needs three positions. Altitudes that are heights over
+    the ground count as none."""
     starts = [_upright_start(problem)]
+    if problem.has_altitudes and problem.up.sure and len(problem.centers) >= ENOUGH_TO_DOUBT:
+        plane = _settle(replace(problem, has_altitudes=False), starts[0], "unused")
+        if are_over_ground(problem.targets[:, 2], plane.placed, problem.up.deviation_deg):
+            return plane
     if problem.has_altitudes and not is_collinear(problem.centers):
         starts.append(fit_similarity_robust(problem.centers, problem.targets, 100)[0])
     models = ["used", "unused"] if problem.has_altitudes else ["unused"]
@@ -187,6 +197,9 @@ def _settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     wandering = _wandering(residuals[inliers], problem.times[inliers], gains)
     scale, north, level, place = _errors(
         normal, wandering, int(inliers.sum()), gps_std, state.drift, model, problem.stated
+    )
+    level = _with_unseen_step(
+        level, problem, state, gains[:, np.argsort(problem.times[inliers], kind="stable")], gps_std
     )
     return PositionFit(
         similarity=similarity, inliers=inliers, residuals=placed - problem.targets, placed=placed,
@@ -362,6 +375,21 @@ def _errors(
     up = math.hypot(mean_up, 2 * float(common[2]) + (abs(drift) + drift_error) / 2)
     level = float(np.degrees(np.hypot(*errors[1:3])))
     return float(math.expm1(min(50.0, errors[0]))), float(np.degrees(errors[3])), level, (across, up)
+
+
+def _with_unseen_step(
+    level_deg: float, problem: Problem, state: _State, gains: np.ndarray, gps_std: np.ndarray
+) -> float:
+    """The error of level with a step in the altitudes that nothing shows: it tilts strips beside each other alike, by
+    `gains` [8, m, 3] in the order of time. No worse than what is known of up without positions leaves."""
+    if problem.stated is not None or gains.shape[1] < ENOUGH_TO_DOUBT:
+        return level_deg
+    after = np.cumsum(gains[1:3, ::-1, 2], axis=1)
+    step_m = max(UNSEEN_STEP * gps_std[2], min(UNSEEN_STEP_M, UNSEEN_STEP_ACROSS * gps_std[:2].mean()))
+    step = 2 * float(step_m * np.linalg.norm(after, axis=0).max())
+    most = float(np.degrees(np.linalg.norm(_tilt(state.rotation @ problem.up.direction))))
+    most = most + 2 * problem.up.deviation_deg if problem.up.sure else 180.0
+    return max(level_deg, min(math.hypot(level_deg, float(np.degrees(step))), most))
 
 
 def _score(problem: Problem, state: _State, inliers: np.ndarray, gps_std: np.ndarray, model: str) -> float:

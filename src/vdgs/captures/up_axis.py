@@ -31,8 +31,13 @@ ROLL_PRIOR = 0.002
 LOOKS_DOWN, AGREE_DEG = 0.85, 12.0
 #: And below this cosine between both the shape of the flight does not say what up is (choice).
 MIN_DOWN_COSINE = 0.5
+#: Below this ratio of singular values of the mean rotation cameras turned about one axis by enough to tell how they
+#: hang from how the world lies (choice).
+TURNED = 0.75
 #: Standard deviations of up in degrees: by views that look down, by cameras that are held level, where in doubt.
 VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0
+#: How up was found where the upper sides of photographs say which way it is.
+UPPER_SIDES = "upper sides of the photographs up"
 HINT = "--up x|y|z|-x|-y|-z says it outright."
 
 
@@ -70,7 +75,7 @@ def estimate_up(
         )
     own, looking = float(image_up @ up), float(forward @ up)
     if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
-        return (-up if own < 0 else up), f"{how}, upper sides of the photographs up"
+        return (-up if own < 0 else up), f"{how}, {UPPER_SIDES}"
     if abs(looking) >= MIN_VIEW_COSINE:
         if same_side and parallel and 2 * abs(own) < abs(looking) and not _turn_about(up, rights, image_up):
             warnings.append(
@@ -131,8 +136,13 @@ def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) 
     if np.linalg.norm(mean) < LOOKS_DOWN or how.startswith("level"):
         return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
     mean = mean / np.linalg.norm(mean)
+    if UPPER_SIDES in how:  # level at a wall, or nearly so: all views are one, but not down
+        return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
     if up @ mean < np.cos(np.radians(AGREE_DEG)):  # a slope, or a lone oblique look: the views are nearer to the truth
-        return mean, max(VIEWS_DEG, float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1)))) / 2), bool(up @ mean > 0)
+        apart = float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1))))
+        turned = np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[1] < TURNED
+        return mean, VIEWS_DEG if turned else max(VIEWS_DEG, apart / 2), bool(up @ mean > 0)
     one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
     middle = up + (1 if one_way else 2) * mean
-    return middle / np.linalg.norm(middle), VIEWS_DEG * (2 if one_way else 1), not doubts
+    deviation = UNCERTAIN_DEG if doubts and one_way else VIEWS_DEG * (2 if one_way else 1)  # maybe level at a wall
+    return middle / np.linalg.norm(middle), deviation, not doubts

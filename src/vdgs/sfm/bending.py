@@ -10,6 +10,7 @@ from vdgs.sfm.gcp_list import GcpObservation
 from vdgs.sfm.georegistration import Georegistration, model_points
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
+from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
 from vdgs.sfm.workspace import call_cancellable
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -56,7 +57,10 @@ def bend_to_positions(
     adjuster = pycolmap.create_pose_prior_bundle_adjuster(_options(hold_focal, threads), known, config, priors, bent)
     call_cancellable(lambda cancellation_token: adjuster.solve())
     bent.update_point_3d_errors()
-    return bent if _tears(model, bent) is None else model
+    if _tears(model, bent) is not None:
+        return model
+    drop_unseen_observations(bent)
+    return bent
 
 
 def bend_to_points(
@@ -84,6 +88,7 @@ def bend_to_points(
     if moved is not None:
         note = f"the model was moved to the control points but not bent: that would move cameras by {moved:.3g} m."
         return model, (note,)
+    drop_unseen_observations(bent)
     return bent, ()
 
 
@@ -121,7 +126,7 @@ def _tears(model: pycolmap.Reconstruction, bent: pycolmap.Reconstruction) -> flo
     numbers = [image.image_id for image in model.images.values() if image.has_pose]
     before, after = (np.array([each.image(k).projection_center() for k in numbers]) for each in (model, bent))
     moved = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
-    worse = bent.compute_mean_reprojection_error() > 1 + 2 * model.compute_mean_reprojection_error()
+    worse = mean_reprojection_error(bent) > 1 + 2 * mean_reprojection_error(model)
     return moved if worse or moved > MOST_BENT * _height(model) else None
 
 

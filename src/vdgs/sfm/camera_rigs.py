@@ -16,6 +16,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm import incremental_mapper
 from vdgs.sfm.global_mapper import MAX_WORSE_PX
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.rig_folders import MIN_FRAMES, degrees_from_mean
 from vdgs.sfm.workspace import Workspace, explain_colmap_errors
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -56,7 +57,7 @@ def _why_not(loose: pycolmap.Reconstruction, rigid: pycolmap.Reconstruction) -> 
     are in truth not fixed to each other are placed so, too, but away from what they show."""
     if rigid.num_reg_images() < loose.num_reg_images():
         return "fewer photographs are placed then"
-    worse = rigid.compute_mean_reprojection_error() - loose.compute_mean_reprojection_error()
+    worse = mean_reprojection_error(rigid) - mean_reprojection_error(loose)
     seen = rigid.compute_num_observations() / loose.compute_num_observations()
     if worse > MAX_WORSE_PX or seen < MIN_SEEN:
         return f"of what photographs show {seen:.0%} are left then, {worse:+.2f} px farther off"

@@ -18,6 +18,7 @@ from vdgs.sfm import gcp_adjustment, georegistration
 from vdgs.sfm.bending import bend_to_positions
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -53,6 +54,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
 
     Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
     """
+    drop_unseen_observations(model)
     control = prepared.gcps
     doubtful = frozenset[str]()
     placed: Georegistration | AlignmentFailure
@@ -72,15 +74,16 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     _refuse_upside_down(model, ground, placed, prepared)
     georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
     latitude, longitude, altitude = prepared.origin
-    altitude = altitude + ground if _knows_altitude(prepared) else 0.0
+    altitude = altitude + ground if _knows_altitude(prepared, placed) else 0.0
     origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
     return Georeferenced(model, placed, origin, survey)
 
 
-def _knows_altitude(prepared: ReconstructionPlan) -> bool:
+def _knows_altitude(prepared: ReconstructionPlan, placed: Georegistration) -> bool:
     """Whether control points or positions say how high the place is."""
     control = prepared.gcps
-    return prepared.gps_priors.has_altitudes or (control is not None and control.has_heights)
+    used = prepared.gps_priors.has_altitudes and (placed.accuracy is None or placed.accuracy.altitude != "none")
+    return used or (control is not None and control.has_heights)
 
 
 def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Georegistration | AlignmentFailure:

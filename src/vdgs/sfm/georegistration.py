@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
@@ -17,6 +18,7 @@ from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.recorded_headings import checked_by_headings
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
 
@@ -34,13 +36,13 @@ LOOKED_UP = (
 )
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
-#: Recorded headings count from so many on that agree so well (mean of unit vectors); the other way round is so far.
-ENOUGH_HEADINGS, ALIKE, OTHER_WAY_DEG = 5, 0.95, 150.0
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
 #: distance is found of about so many photographs.
 MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
+#: Altitudes along a line that change so many times their error against what is known of up are worth a note (choice).
+MUCH_DRIFT = 4.0
 ADVICE_WRITE_GPS = (
     "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
     "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
@@ -120,20 +122,27 @@ def georegister(
         )
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
-    fit, barometer = _best_fit(levelled, taken)
+    fit, barometer, over_ground = _best_fit(levelled, taken)
+    if over_ground:
+        positions = replace(positions, has_altitudes=False)
     elsewhere = _elsewhere(fit, far)
     if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
+    fit, of_reading = _checked_reading(fit, problem, positions, offsets)
+    on_a_line = is_nearly_collinear(targets, positions.gps_std[rows])
+    fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
+    fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
     notes += [f"{refused}; used all the same, as asked for."] if refused else []
     notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
-    how = _method(fit, barometer, is_nearly_collinear(targets, positions.gps_std[rows]), positions.source, up.how)
+    how = _method(fit, barometer, on_a_line, positions.source, up.how)
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
-    notes += _of_altitudes(fit, barometer) + _of_north(fit.similarity, images, taken)
+    notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
+    notes += of_reading + of_line + of_north
     return Georegistration(
         similarity=fit.similarity,
         method=how,
@@ -257,21 +266,68 @@ def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
     ]
 
 
-def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[PositionFit, bool]:
-    """The fit, and whether its heights are the barometer's: over the take-off, where altitudes drift against them."""
+def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[PositionFit, bool, bool]:
+    """The fit; whether its heights are the barometer's: over the take-off, where altitudes drift against them; and
+    whether what is recorded as altitudes are heights over the ground, and counts as none."""
     fit = fit_positions(problem)
+    over_ground = problem.has_altitudes and fit.altitude == "none"
+    problem = replace(problem, has_altitudes=problem.has_altitudes and not over_ground)
     relative = np.array([np.nan if photo.relative_altitude is None else photo.relative_altitude for photo in taken])
     if fit.altitude == "used" or not np.isfinite(relative).all() or np.ptp(relative) == 0:
-        return fit, False
+        return fit, False, over_ground
     targets = problem.targets.copy()
     targets[:, 2] = relative + np.median(targets[:, 2] - relative)
     steady = fit_positions(replace(problem, targets=targets, has_altitudes=True))
     if steady.altitude != "used" or (problem.has_altitudes and steady.score >= fit.score):
-        return fit, False
+        return fit, False, over_ground
     if problem.has_altitudes:  # they alone say how high the take-off is, with all of their drift
         across, up = steady.place_error_m
         steady = replace(steady, place_error_m=(across, max(up, fit.place_error_m[1])), drift_m=fit.drift_m)
-    return steady, True
+    return steady, True, over_ground
+
+
+def _checked_reading(
+    fit: PositionFit, problem: Problem, positions: GpsPriors, offsets: AltitudeOffsets | None
+) -> tuple[PositionFit, list[str]]:
+    """The fit with altitudes as uncertain as they are where they differ as those in feet or of the wrong sign do from
+    heights by the photographs, and a note."""
+    if not positions.has_altitudes or (fit.altitude == "used" and offsets is None):
+        return fit, []
+    what, off = wrong_reading(problem.targets[:, 2] + positions.origin[2], fit.placed[:, 2])
+    if not what:
+        return fit, []
+    across, up = fit.place_error_m
+    note = (
+        f"the altitudes ({positions.source}) differ between the photographs as altitudes do that are {what}: heights "
+        f"above the sea may be off by {two_digits(off)} m. A table of positions (--gps) mends it."
+    )
+    return replace(fit, place_error_m=(across, up + off)), [note]
+
+
+def _checked_on_a_line(fit: PositionFit, problem: Problem) -> tuple[PositionFit, list[str]]:
+    """The fit of positions along one line, where nothing tells a drift of altitudes from a climb but what is known of
+    up without positions: heights are no better than the two differ. A note where that is much."""
+    if fit.altitude != "used" or problem.stated is not None or not problem.up.sure:
+        return fit, []
+    apart = fit.placed[:, 2] - fit.placed @ fit.similarity.rotation @ problem.up.direction
+    drift, (across, up) = float(np.ptp(apart[fit.inliers])), fit.place_error_m
+    found = replace(fit, place_error_m=(across, up + drift / 2))
+    if drift < MUCH_DRIFT * up:
+        return found, []
+    note = (
+        f"along the one line of the flight the recorded altitudes change by {two_digits(drift)} m against what "
+        f"{problem.up.how} say: a drift, or up is off. Heights above the sea are only good to "
+        f"±{two_digits(found.place_error_m[1])} m."
+    )
+    return found, [note]
+
+
+def _over_ground(fit: PositionFit) -> str:
+    return (
+        "the recorded altitudes are nearly one for all photographs, which themselves show a flight that rises and "
+        f"falls by {two_digits(float(np.ptp(fit.placed[:, 2])))} m as along a slope: heights over the ground? They are "
+        "not used, and heights above the sea are not known."
+    )
 
 
 def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
@@ -290,30 +346,6 @@ def _of_altitudes(fit: PositionFit, barometer: bool) -> list[str]:
             f"north and up are found without them; {good}"
         ]
     return []
-
-
-def _of_north(
-    similarity: Similarity, images: Mapping[str, pycolmap.Image], taken: Sequence[ImageMetadata]
-) -> list[str]:
-    """A note where all recorded headings say that the scene lies the other way round: both hemispheres lost."""
-    seen = [photo for photo in taken if photo.attitude is not None]
-    turns = np.array(
-        [
-            similarity.rotation @ _rotation(images[photo.name]).T @ photo.attitude.camera_from_enu
-            for photo in seen
-            if photo.attitude is not None
-        ]
-    ).reshape(-1, 3, 3)
-    if len(turns) < ENOUGH_HEADINGS:
-        return []
-    mean = np.mean(np.exp(1j * np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])))
-    away = abs(float(np.degrees(np.angle(mean))))
-    if abs(mean) < ALIKE or away < OTHER_WAY_DEG:
-        return []
-    return [
-        f"north is turned by {away:.0f}° from what the drone recorded. Are both hemispheres (S and W) missing from the "
-        "positions?"
-    ]
 
 
 def _other_readings(targets: np.ndarray, origin: tuple[float, float, float]) -> dict[str, np.ndarray]:

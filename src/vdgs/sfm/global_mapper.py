@@ -27,6 +27,7 @@ from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm import feature_matching, incremental_mapper
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.image_metadata import EXACT_MODEL
+from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.child_python import python_command
@@ -164,8 +165,8 @@ def _why_not(parts: Sequence[pycolmap.Reconstruction], joined: pycolmap.Reconstr
     """Why a model is not taken in place of its parts; empty where it is."""
     if len(placed_images(joined)) <= len(placed_images(parts[0])):
         return "no more are placed"
-    if joined.compute_mean_reprojection_error() > MAX_ERROR_PX:
-        return f"points are {joined.compute_mean_reprojection_error():.1f} px from where they should be"
+    if mean_reprojection_error(joined) > MAX_ERROR_PX:
+        return f"points are {mean_reprojection_error(joined):.1f} px from where they should be"
     for part in parts:
         if len(placed_images(part)) >= MIN_PART and not _keeps_shape(part, joined):
             return f"the part of {len(placed_images(part))} has another shape in it"
@@ -189,7 +190,7 @@ def _keeps_shape(part: pycolmap.Reconstruction, joined: pycolmap.Reconstruction)
     angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     seen = [before[name] for name in names if before[name].num_points3D]
     away = np.median([incremental_mapper.height_over_points(image, part) for image in seen])
-    worse = joined.compute_mean_reprojection_error() - part.compute_mean_reprojection_error()
+    worse = mean_reprojection_error(joined) - mean_reprojection_error(part)
     return bool(
         np.sqrt((off**2).mean()) <= MAX_MOVED_SHARE * away
         and np.median(angles) <= MAX_TURNED_DEG

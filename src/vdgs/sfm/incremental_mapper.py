@@ -22,6 +22,7 @@ from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, FISHEYE, ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
+from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -123,9 +124,9 @@ def is_contradicted(
         return False
     fitted = pycolmap.Reconstruction(model)
     fitted.update_point_3d_errors()
-    as_held = fitted.compute_mean_reprojection_error()
+    as_held = mean_reprojection_error(fitted)
     _fit_focal(fitted, threads)
-    nearer = 1 - fitted.compute_mean_reprojection_error() / as_held
+    nearer = 1 - mean_reprojection_error(fitted) / as_held
     return nearer >= CLEARLY_NEARER and any(
         not alike(fitted.cameras[k].mean_focal_length(), focal) for k, focal in said.items() if k in fitted.cameras
     )
@@ -271,6 +272,8 @@ def read_models(workspace: Workspace, aside: bool = False) -> list[pycolmap.Reco
     """What `run_mapper` found, the model of most photographs first."""
     place = workspace.models_aside if aside else workspace.models
     models = [pycolmap.Reconstruction(folder) for folder in sorted(place.iterdir()) if folder.is_dir()]
+    for model in models:
+        drop_unseen_observations(model)
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 

@@ -50,6 +50,7 @@ from vdgs.sfm.posed_photographs import (
 )
 from vdgs.sfm.random_points import random_points
 from vdgs.sfm.reconstruct import check_nothing_trained, writing
+from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress, silence_colmap
 from vdgs.system.atomic_files import write_json, write_text
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -97,6 +98,7 @@ def make_posed_capture(
         _find_features(photographs, work, request, threads, console)
         _match(photographs, work, request, threads, console)
         model = _triangulate(photographs, work, threads, console)
+        drop_unseen_observations(model)
         if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
             finished.forget(CAPTURE)  # before: an interrupted removal is no finished capture
             for name in (*capture_writer.IMAGE_FOLDERS, "sparse"):
@@ -106,7 +108,7 @@ def make_posed_capture(
             finished.begin(CAPTURE, photographs.keys[CAPTURE])
         _write(photographs, work, model, request, threads, console)
         finished.finish(CAPTURE, photographs.keys[CAPTURE])
-    if error := model.compute_mean_reprojection_error():  # random points have none
+    if error := mean_reprojection_error(model):  # random points have none
         console.print(f"{model.num_points3D():,} points, mean reprojection error {error:.2f} px", highlight=False)
 
 

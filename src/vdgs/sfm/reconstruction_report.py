@@ -17,12 +17,13 @@ from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
 from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_points, tilt_from_attitudes
-from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
@@ -90,8 +91,9 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         found=len(collection.images) + len(collection.excluded), registered=len(images),
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
-        reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
-        altitude_reference=_altitudes(plan) if placed and placed.is_georeferenced else "", origin=result.found.origin,
+        reprojection_px=mean_reprojection_error(model), georeferenced=georeferenced,
+        altitude_reference=_altitudes(plan, placed) if placed and placed.is_georeferenced else "",
+        origin=result.found.origin,
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
         focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
@@ -144,10 +146,12 @@ def check_enough_placed(model: pycolmap.Reconstruction, left_out: Sequence[Exclu
         )
 
 
-def _altitudes(prepared: ReconstructionPlan) -> str:
+def _altitudes(prepared: ReconstructionPlan, placed: Georegistration) -> str:
     control = prepared.gcps
     if control is not None and control.has_control_points:
         return f"heights as in {control.source} ({control.crs})"
+    if placed.accuracy is not None and placed.accuracy.altitude == "none":
+        return ALTITUDE_UNKNOWN
     return prepared.gps_priors.altitude_reference
 
 

@@ -1,0 +1,203 @@
+"""Positions and photographs that contradict each other: one is believed only where it is clear which, and errors are
+as large as what nothing decides."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vdgs.captures.gps_altitudes import wrong_reading
+from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.up_axis import up_by_views
+from vdgs.sfm.georegistration import _checked_on_a_line
+from vdgs.sfm.image_metadata import attitude_from_gimbal
+from vdgs.sfm.recorded_headings import checked_by_headings
+
+pytestmark = pytest.mark.slow
+
+NADIR = np.diag([1.0, -1, -1])
+
+
+def fit_of(places: np.ndarray, recorded: np.ndarray, up: Up) -> PositionFit:
+    """The fit of cameras at `places` [n, 3], one after the other; their world is the true one."""
+    return fit_positions(Problem(centers=places, targets=recorded, times=np.linspace(0, 1, len(places)), up=up))
+
+
+def tilt_deg(fit: PositionFit) -> float:
+    return float(np.degrees(np.arccos(np.clip(fit.similarity.rotation[2, 2], -1, 1))))
+
+
+def facade(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Cameras [20, 3] in four columns up and down, 20 m before a wall in the north, held level, and rotations."""
+    heights = [5.0, 9, 13, 17, 21]
+    places = np.array([[6 * c - 9, -20, z] for c in range(4) for z in heights[:: 1 if c % 2 == 0 else -1]])
+    level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    rotations = [level @ Rotation.from_euler("xyz", rng.normal(0, 1, 3), degrees=True).as_matrix() for _ in places]
+    return places + rng.normal(0, 0.3, places.shape), np.array(rotations)
+
+
+@pytest.mark.parametrize("ground", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_facade_stands_where_its_positions_have_it(ground, seed):
+    """Whatever share of the points is of the ground before it: none of it may be taken for a flight that looks down."""
+    rng = np.random.default_rng(seed)
+    places, rotations = facade(rng)
+    points = rng.uniform([-15, -0.3, 0], [15, 0.3, 22], (600, 3))
+    flat = rng.random(600) < ground
+    points[flat] = rng.uniform([-15, -12, -0.2], [15, 0, 0.2], (int(flat.sum()), 3))
+    direction, deviation, sure = up_by_views(places, rotations, points)
+    assert not sure or direction[2] > 0.9
+    fit = fit_of(places, places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8], Up(direction, deviation, "", sure))
+    assert tilt_deg(fit) < 5
+    assert not fit.why_refused("EXIF")
+    assert abs(fit.similarity.scale - 1) < max(0.05, fit.scale_error)
+
+
+def test_a_slope_is_told_from_a_look_aside_by_cameras_that_turn():
+    """Terrain and flight tilted alike: cameras that fly back and forth hang as they hang, and look down on average."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(5) * 12.0, np.arange(4) * 14.0)
+    places = np.stack([x.ravel(), y.ravel(), 45 + 0.4 * y.ravel()], axis=1)
+    ground = rng.uniform([-20, -20, 0], [70, 60, 1], (500, 3))
+    ground[:, 2] += 0.4 * ground[:, 1]
+    lean = Rotation.from_euler("x", 5, degrees=True).as_matrix()
+    there_and_back, one_way = (
+        np.array([lean @ NADIR @ Rotation.from_euler("z", turn * (k // 5 % 2), degrees=True).as_matrix()
+                  for k in range(20)])
+        for turn in (180.0, 0.0)
+    )  # fmt: skip
+    up, deviation, _ = up_by_views(places, there_and_back, ground)
+    assert np.degrees(np.arccos(up[2])) < deviation <= 3
+    up, deviation, _ = up_by_views(places, one_way, ground)
+    assert deviation > 5
+
+
+def along_a_slope(climb_deg: float = 22.0) -> np.ndarray:
+    """Four strips of five photographs that keep their height over a hillside."""
+    x, y = np.meshgrid(np.arange(5) * 12.0, np.arange(4) * 14.0)
+    return np.stack([x.ravel(), y.ravel(), 500 + np.tan(np.radians(climb_deg)) * y.ravel()], axis=1)
+
+
+def views(off_deg: float, deviation_deg: float = 3.0) -> Up:
+    """Up that is off by an angle, to the north."""
+    off = np.radians(off_deg)
+    return Up(np.array([0, np.sin(off), np.cos(off)]), deviation_deg, "the views")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_heights_over_the_ground_are_not_taken_for_altitudes(noise, seed):
+    rng = np.random.default_rng(seed)
+    places = along_a_slope()
+    recorded = places + rng.normal(0, 0.5, places.shape)
+    recorded[:, 2] = 45 + rng.normal(0, noise, len(places))
+    fit = fit_of(places, recorded, views(-2))
+    assert fit.altitude == "none"
+    assert tilt_deg(fit) < fit.level_error_deg < 10
+    assert abs(fit.similarity.scale - 1) < 2 * fit.scale_error
+
+
+@pytest.mark.parametrize("climb_deg", [0.0, 5.0, 22.0])
+@pytest.mark.parametrize("off_deg", [-4.0, 0.0, 4.0])
+def test_altitudes_of_a_receiver_are_used_along_a_slope_and_over_level_ground(climb_deg, off_deg):
+    rng = np.random.default_rng(2)
+    places = along_a_slope(climb_deg)
+    fit = fit_of(places, places + rng.normal(0, 0.5, places.shape), views(off_deg))
+    assert fit.altitude == "used"
+    assert tilt_deg(fit) < 3
+
+
+def checked(
+    places: np.ndarray, yaws: np.ndarray, lag_m: float, compass_deg: float
+) -> tuple[PositionFit, PositionFit, list[str]]:
+    """The fit of positions that lag behind along the track, as it is and as headings leave it, with their notes."""
+    rng = np.random.default_rng(5)
+    along = np.gradient(places[:, :2], axis=0)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    fit = fit_of(places, places - np.c_[lag_m * along, 0 * along[:, 0]] + rng.normal(0, 0.4, places.shape), views(0))
+    poses = [attitude_from_gimbal(yaw, -60.0, 0.0) for yaw in yaws]
+    images = {
+        str(k): SimpleNamespace(
+            cam_from_world=lambda pose=pose: SimpleNamespace(
+                rotation=SimpleNamespace(matrix=lambda: pose.camera_from_enu)
+            )
+        )
+        for k, pose in enumerate(poses)
+    }
+    taken = [
+        SimpleNamespace(name=str(k), attitude=attitude_from_gimbal(yaw + compass_deg + rng.normal(0, 1), -60.0, 0.0))
+        for k, yaw in enumerate(yaws)
+    ]
+    after, notes = checked_by_headings(fit, images, taken, np.linspace(0, 1, len(places)))
+    return fit, after, notes
+
+
+def orbit() -> tuple[np.ndarray, np.ndarray]:
+    yaws = 18.0 * np.arange(20)
+    around = np.radians(yaws + 180)
+    return np.stack([32 * np.sin(around), 32 * np.cos(around), 20 + 0.5 * (np.arange(20) % 3)], axis=1), yaws
+
+
+@pytest.mark.parametrize("lag_m", [-3.0, 3.0])
+def test_positions_that_lag_around_an_orbit_say_north_no_better_than_the_headings(lag_m):
+    fit, after, notes = checked(*orbit(), lag_m, 0.0)
+    off = abs(np.degrees(np.arctan2(*fit.similarity.rotation[[1, 0], [0, 0]])))
+    assert fit.north_error_deg < off < after.north_error_deg < 2 * off
+    assert abs(fit.similarity.scale - 1) < after.scale_error < 0.05
+    assert "lag" in notes[0]
+
+
+@pytest.mark.parametrize("compass_deg", [0.0, 6.0, 15.0])
+def test_a_compass_that_is_off_says_nothing_of_strips_flown_back_and_forth(compass_deg):
+    x, y = np.meshgrid(np.arange(6) * 12.0, np.arange(4) * 14.0)
+    x[1::2] = x[1::2, ::-1]
+    places = np.stack([x.ravel(), y.ravel(), 45 + (np.arange(24) % 3)], axis=1)
+    fit, after, notes = checked(places, np.repeat([90.0, 270, 90, 270], 6), 0.0, compass_deg)
+    assert (after, notes) == (fit, [])
+
+
+def test_headings_that_agree_leave_an_orbit_as_it_is():
+    fit, after, notes = checked(*orbit(), 0.0, 1.0)
+    assert (after, notes) == (fit, [])
+
+
+def test_headings_the_other_way_round_ask_for_both_hemispheres():
+    assert "hemispheres" in checked(*orbit(), 0.0, 180.0)[2][0]
+
+
+@pytest.mark.parametrize("step_m", [-3.0, -2.0, 0.0, 2.0, 3.0])
+def test_level_of_two_strips_holds_a_step_between_their_altitudes(step_m):
+    x, y = np.meshgrid(np.arange(10) * 9.0, [-8.0, 8.0])
+    places = np.stack([x.ravel(), y.ravel(), np.full(20, 45.0)], axis=1)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
+        recorded[10:, 2] += step_m
+        fit = fit_of(places, recorded, views(1.0))
+        assert tilt_deg(fit) < fit.level_error_deg < 20
+
+
+@pytest.mark.parametrize(("factor", "said", "off"), [(3.2808, "feet", 1140.0), (-1.0, "wrong sign", 1000.0)])
+def test_altitudes_in_feet_or_of_the_wrong_sign_are_named_by_what_they_differ_by(factor, said, off):
+    rng = np.random.default_rng(0)
+    heights = np.r_[np.full(10, 500.0), np.full(10, 517.0)] + rng.normal(0, 0.5, 20)
+    what, apart = wrong_reading(factor * heights + rng.normal(0, 0.8, 20), heights - 470)
+    assert said in what
+    assert apart == pytest.approx(off, rel=0.05)
+    assert wrong_reading(heights + np.repeat([0, 12.0], 10), heights) == ("", 0.0)
+    assert wrong_reading(factor * np.full(20, 500.0), np.full(20, 30.0)) == ("", 0.0)
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 8.0, 17.0])
+def test_heights_along_one_line_are_no_better_than_a_drift_that_nothing_tells(drift_m):
+    rng = np.random.default_rng(1)
+    places = np.stack([8.0 * np.arange(14), np.zeros(14), np.full(14, 45.0)], axis=1)
+    recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
+    recorded[:, 2] += np.linspace(0, drift_m, 14)
+    problem = Problem(centers=places, targets=recorded, times=np.linspace(0, 1, 14), up=views(0, 6.0))
+    fit, notes = _checked_on_a_line(fit_positions(problem), problem)
+    assert abs(float((fit.placed - places)[:, 2].mean())) < fit.place_error_m[1] < 2 + drift_m
+    assert bool(notes) == (drift_m > 0)
