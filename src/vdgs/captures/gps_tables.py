@@ -20,6 +20,7 @@ from vdgs.captures.angles import degrees_of_text
 from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
 from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
+    ToGeodetic,
     datum_error,
     height_unit,
     in_units_of,
@@ -109,6 +110,8 @@ class _Columns(NamedTuple):
     """The coordinate system that the table names."""
     altitude_unit: float | None = None
     """Metres in one of its altitudes; None where their heading does not say, which are in the system's unit."""
+    system_altitude_unit: float = 1.0
+    """Metres in the unit of the system's heights."""
     note: str = ""
     """How columns are read that do not say it themselves."""
     heights: tuple[str, ...] = ()
@@ -152,12 +155,7 @@ def read_gps_table(file: Path) -> GpsTable:
     placed = [row for row in rows if _has_place(row, columns)]
     if not placed:
         raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
-    place = _projected if columns.system is not None and "x" in columns.where else _geodetic
-    positions = place(placed, columns, file)
-    if place is _geodetic and columns.system is not None:
-        given = np.array(positions)[:, [1, 0, 2]] / [1, 1, height_unit(columns.system)]
-        changed = to_geodetic(columns.system, file)[0](given)
-        positions = [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)]
+    positions, system = _positions(placed, columns, file)
     found = [
         GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
         for row, position in zip(placed, positions, strict=True)
@@ -170,7 +168,6 @@ def read_gps_table(file: Path) -> GpsTable:
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
-    system = "" if columns.system is None else to_geodetic(columns.system, file)[1]
     system = system if columns.altitude_unit in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
     if doubt := system.partition("; ")[2]:
         notes.append(f"{file.name}: {doubt}.")
@@ -214,8 +211,11 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         angles = {what: read_heading(rows[0].words[known[what]]) for what in ("lat", "lon")}
         latitude, longitude = (1.0 if angle.degrees is None else angle.degrees for angle in angles.values())
         datum = system if system is not None and _is_datum(system, file) else None
-        columns = _Columns(known, datum, unit, "", heights, units, (latitude, longitude), angles)
-        return columns._replace(o_side=west_or_east(rows[0].words)), rows[1:]
+        columns = _Columns(
+            known, datum, unit, heights=heights, deviation_units=units, across_units=(latitude, longitude),
+            angles=angles, o_side=west_or_east(rows[0].words),
+        )  # fmt: skip
+        return columns, rows[1:]
     if {"lat", "lon"} <= set(known):
         found = ", ".join(word for word in rows[0].words if word)
         remedy = f"It is {_BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
@@ -300,6 +300,21 @@ def _word(row: Row, columns: _Columns, what: str) -> str:
 def _has_place(row: Row, columns: _Columns) -> bool:
     both = ("x", "y") if "x" in columns.where and columns.system is not None else ("lat", "lon")
     return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in UNKNOWN for what in both)
+
+
+def _positions(rows: Sequence[Row], columns: _Columns, file: Path) -> tuple[list[tuple[float, float, float]], str]:
+    """Latitude, longitude and altitude of each row, and the name of the system that they are given in; "" where the
+    table names none. Raises CaptureError."""
+    if columns.system is None:
+        return _geodetic(rows, columns, file), ""
+    change, name = to_geodetic(columns.system, file)
+    # Here, once: PROJ takes tens of milliseconds to read a system.
+    columns = columns._replace(system_altitude_unit=height_unit(columns.system))
+    if "x" in columns.where:
+        return _projected(rows, columns, change, name, file), name
+    positions = _geodetic(rows, columns, file)
+    changed = change(np.array(positions)[:, [1, 0, 2]] / [1, 1, columns.system_altitude_unit])
+    return [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)], name
 
 
 def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
@@ -392,13 +407,14 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     value = float(number[1].replace(",", "."))
     if value in NO_DATA:
         return math.nan
-    value *= behind.meters if behind.units else columns.altitude_unit or height_unit(columns.system)
+    value *= behind.meters if behind.units else columns.altitude_unit or columns.system_altitude_unit
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 
 
-def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
-    change, system = to_geodetic(columns.system or "", file)
+def _projected(
+    rows: Sequence[Row], columns: _Columns, change: ToGeodetic, system: str, file: Path
+) -> list[tuple[float, float, float]]:
     places = []
     for row in rows:
         x, y = (number_of(_word(row, columns, what)) for what in ("x", "y"))
@@ -406,11 +422,9 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
             words = [_word(row, columns, what) for what in ("x", "y", "alt")]
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
         places.append((x, y, _altitude(row, columns, file)))
-    if not places:
-        return []
     given = np.array(places)
     across = [in_units_of(columns.system or "", unit, file) for unit in columns.across_units]
-    given *= [*across, 1 / height_unit(columns.system)]
+    given *= [*across, 1 / columns.system_altitude_unit]
     known = np.isfinite(given[:, 2])
     changed = change(np.where(np.isfinite(given), given, 0.0))
     changed[~known, 2] = math.nan
