@@ -41,6 +41,7 @@ from vdgs.captures.table_columns import (
     number_of,
     parted_angles,
     plain_number,
+    side_letter,
     told_meters,
     west_or_east,
     with_names,
@@ -70,6 +71,7 @@ _DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)")
+_WORD = re.compile(r"[^\W\d_]+")
 #: O behind an angle stands for east or for west.
 _O = re.compile(r"\bO\b|(?<=[\d'\"″′°])O$|^O(?=\d)", re.IGNORECASE)
 #: Degrees and minutes in one number, of which programs may have cut the zeros before the other angle of the row.
@@ -352,7 +354,8 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
     for words in a column of sides that are none.
     """
     word, side_word, heading = _word(row, columns, what), _word(row, columns, reference), columns.angles.get(what)
-    if _O.search(word) or side_word.upper() == "O":
+    word = _WORD.sub(lambda match: side_letter(match[0], reference) or match[0], word)
+    if _O.search(word) or _O.search(side_word):
         if not columns.o_side:
             raise CaptureError(
                 f"{file}: line {row.number}: O is west (oeste, ouest, ovest) or east (Ost). Write W or E instead."
@@ -360,7 +363,9 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
         word, side_word = _O.sub(columns.o_side, word), _O.sub(columns.o_side, side_word)
     if word.count(",") == 1 and "." not in word:
         word = word.replace(",", ".")
-    side_word = _side(side_word, axis, f"{file}: line {row.number}") or (heading.side if heading is not None else "")
+    side_word = _side(side_word, reference, axis, f"{file}: line {row.number}") or (
+        heading.side if heading is not None else ""
+    )
     try:
         number = float(word)
         read: tuple[float, bool] | None = (number, False)
@@ -382,12 +387,14 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
     return side[0] if side is not None and side[1] else read[0]
 
 
-def _side(word: str, axis: str, where: str) -> str:
+def _side(word: str, reference: str, axis: str, where: str) -> str:
     """N, S, E or W by the word of a column of sides; nothing where it is empty. Raises CaptureError."""
     if word.lower() in UNKNOWN:
         return ""
     positive, negative = ("N", "S") if axis == "latitude" else ("E", "W")
     for said in (word, word.split()[0]):  # `South latitude`
+        if letter := side_letter(said, reference):
+            return letter
         side = degrees_of_text(f"1 {said}", axis)
         if side is not None and side[1]:
             return positive if side[0] > 0 else negative
