@@ -238,3 +238,22 @@ def test_a_datum_over_degrees_counts(tmp_path):
     assert degrees.rows[0].position[:2] == pytest.approx(plane.rows[0].position[:2], abs=1e-9)
     assert abs(degrees.rows[0].position[0] - 48.1) > 1e-4
     assert degrees.datum_error_m == plane.datum_error_m > 0
+
+
+@pytest.mark.parametrize("head", ["EPSG:5650+7837\nname,x,y,alt", "EPSG:4230\nname,lon,lat,alt"])
+def test_a_system_is_read_as_often_for_many_rows_as_for_few(tmp_path, monkeypatch, head):
+    """PROJ takes tens of milliseconds for one, and flights have thousands of photographs."""
+    pyproj = pytest.importorskip("pyproj")
+    parsed, parse = list[str](), pyproj.CRS.from_user_input
+    monkeypatch.setattr(
+        pyproj.CRS, "from_user_input", lambda *system: (parsed.append(str(system[0])), parse(*system))[1]
+    )
+    x, y = (33_500_000, 5_600_000) if "x,y" in head else (15, 48)
+    counts = []
+    for count in (3, 30):
+        rows = [f"{k}.jpg,{x + k * 1e-3},{y},500" for k in range(count)]
+        (tmp_path / f"{count}.csv").write_text("\n".join([head, *rows]))
+        parsed.clear()
+        assert len(read_gps_table(tmp_path / f"{count}.csv").rows) == count
+        counts.append(len(parsed))
+    assert counts[0] == counts[1] > 0

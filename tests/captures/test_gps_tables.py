@@ -470,6 +470,28 @@ def test_words_that_are_no_sides_are_refused(tmp_path, side):
         read_gps_table(file)
 
 
+SIDES = {
+    "S": "s S. south Sud süd SÜD sur Sul South_latitude", "W": "w W. west ovest Oeste ouest Oeste_long.",
+    "N": "n N. North nord norte Nord_Breite", "E": "e E. east est Ost OST este Ost_Länge",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("side", "word"), [(side, word) for side, words in SIDES.items() for word in words.split()])
+def test_words_of_several_languages_say_the_side(tmp_path, side, word):
+    """In columns of their own, found by their headings or by these words, and behind the angle."""
+    south, west = (word.replace("_", " "), "W") if side in "NS" else ("S", word.replace("_", " "))
+    row = f"a.jpg,33.5,{south},70.6,{west},500"
+    tables = [f"name,latitude,latitude ref,longitude,longitude ref,alt\n{row}"]
+    if "_" not in word:
+        tables.append(f"name,latitude,a,longitude,b,alt\n{row}")
+    if word.isalpha():
+        tables.append(f"name,lat,lon,alt\na.jpg,33.5 {south},{west} 70.6,500")
+    for table in tables:
+        (tmp_path / "t.csv").write_text(table, encoding="utf-8")
+        place = (33.5 if side == "N" else -33.5, 70.6 if side == "E" else -70.6, 500)
+        assert read_gps_table(tmp_path / "t.csv").rows[0].position == pytest.approx(place, abs=1e-9)
+
+
 @pytest.mark.parametrize("units", [",deg,deg,ft", "[-],[°],[°],[ft]", "-,°,°,pies"])
 def test_a_row_of_units_below_the_headings_counts(tmp_path, units):
     (file := tmp_path / "t.csv").write_text(f"name,lat,lon,alt\n{units}\na.jpg,-33.5,-70.6,1640.41995\n")

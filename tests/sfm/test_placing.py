@@ -83,6 +83,9 @@ def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_
     assert written["scale_percent"] > 0
     monkeypatch.setattr(workspace, "_VERSION", " by vdgs 99.0")  # after an upgrade
     assert "nothing to do" in again(nine, capture, tmp_path / "gps.csv")[1]
+    moved, said = again(nine, capture, table(tmp_path / "gps.csv", nine, lambda enu: enu - shift))
+    assert "placed anew" in said
+    assert moved.origin[2] - before.origin[2] == pytest.approx(-15, abs=1)
 
 
 @pytest.mark.parametrize("altitudes", [True, False])

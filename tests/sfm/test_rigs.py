@@ -71,6 +71,7 @@ def fly(folder: Path, late_s: float = 0.0, away_m: float = 0.0, pitch: float = -
         pytest.param({"pitch": -90.0}, "", id="a rig"),
         pytest.param({"late_s": 1500, "away_m": 1.0}, "", id="whose clocks are set apart"),
         pytest.param({"away_m": 30.0}, "other places", id="two drones"),
+        pytest.param({"late_s": 1500, "away_m": -4.5}, "other moments", id="near the next frame, far from that before"),
         pytest.param({"late_s": 1500, "away_m": 1.0, "turns": False}, "the angle between", id="two flights"),
     ],
 )

@@ -54,7 +54,8 @@ def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any]
     if changed:
         raise RunError(
             f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "
-            "Restore the capture as it was, or begin another run: vdgs run CAPTURE --output RUN"
+            "Restore the capture as it was (or the former version of vdgs, where that read the same files otherwise), "
+            "or begin another run: vdgs run CAPTURE --output RUN"
         )
 
 

@@ -20,6 +20,7 @@ from vdgs.captures.angles import degrees_of_text
 from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
 from vdgs.captures.coordinate_systems import (
     HEIGHTS_IN_METERS,
+    ToGeodetic,
     datum_error,
     height_unit,
     in_units_of,
@@ -40,6 +41,7 @@ from vdgs.captures.table_columns import (
     number_of,
     parted_angles,
     plain_number,
+    side_letter,
     told_meters,
     west_or_east,
     with_names,
@@ -69,6 +71,7 @@ _DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
 #: Words of exiftool behind altitudes below the sea.
 _BELOW = re.compile(r"below|^1$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)")
+_WORD = re.compile(r"[^\W\d_]+")
 #: O behind an angle stands for east or for west.
 _O = re.compile(r"\bO\b|(?<=[\d'\"″′°])O$|^O(?=\d)", re.IGNORECASE)
 #: Degrees and minutes in one number, of which programs may have cut the zeros before the other angle of the row.
@@ -109,6 +112,8 @@ class _Columns(NamedTuple):
     """The coordinate system that the table names."""
     altitude_unit: float | None = None
     """Metres in one of its altitudes; None where their heading does not say, which are in the system's unit."""
+    system_altitude_unit: float = 1.0
+    """Metres in the unit of the system's heights."""
     note: str = ""
     """How columns are read that do not say it themselves."""
     heights: tuple[str, ...] = ()
@@ -152,12 +157,7 @@ def read_gps_table(file: Path) -> GpsTable:
     placed = [row for row in rows if _has_place(row, columns)]
     if not placed:
         raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
-    place = _projected if columns.system is not None and "x" in columns.where else _geodetic
-    positions = place(placed, columns, file)
-    if place is _geodetic and columns.system is not None:
-        given = np.array(positions)[:, [1, 0, 2]] / [1, 1, height_unit(columns.system)]
-        changed = to_geodetic(columns.system, file)[0](given)
-        positions = [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)]
+    positions, system = _positions(placed, columns, file)
     found = [
         GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
         for row, position in zip(placed, positions, strict=True)
@@ -170,7 +170,6 @@ def read_gps_table(file: Path) -> GpsTable:
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
-    system = "" if columns.system is None else to_geodetic(columns.system, file)[1]
     system = system if columns.altitude_unit in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
     if doubt := system.partition("; ")[2]:
         notes.append(f"{file.name}: {doubt}.")
@@ -214,8 +213,11 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         angles = {what: read_heading(rows[0].words[known[what]]) for what in ("lat", "lon")}
         latitude, longitude = (1.0 if angle.degrees is None else angle.degrees for angle in angles.values())
         datum = system if system is not None and _is_datum(system, file) else None
-        columns = _Columns(known, datum, unit, "", heights, units, (latitude, longitude), angles)
-        return columns._replace(o_side=west_or_east(rows[0].words)), rows[1:]
+        columns = _Columns(
+            known, datum, unit, heights=heights, deviation_units=units, across_units=(latitude, longitude),
+            angles=angles, o_side=west_or_east(rows[0].words),
+        )  # fmt: skip
+        return columns, rows[1:]
     if {"lat", "lon"} <= set(known):
         found = ", ".join(word for word in rows[0].words if word)
         remedy = f"It is {_BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
@@ -302,6 +304,21 @@ def _has_place(row: Row, columns: _Columns) -> bool:
     return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in UNKNOWN for what in both)
 
 
+def _positions(rows: Sequence[Row], columns: _Columns, file: Path) -> tuple[list[tuple[float, float, float]], str]:
+    """Latitude, longitude and altitude of each row, and the name of the system that they are given in; "" where the
+    table names none. Raises CaptureError."""
+    if columns.system is None:
+        return _geodetic(rows, columns, file), ""
+    change, name = to_geodetic(columns.system, file)
+    # Here, once: PROJ takes tens of milliseconds to read a system.
+    columns = columns._replace(system_altitude_unit=height_unit(columns.system))
+    if "x" in columns.where:
+        return _projected(rows, columns, change, name, file), name
+    positions = _geodetic(rows, columns, file)
+    changed = change(np.array(positions)[:, [1, 0, 2]] / [1, 1, columns.system_altitude_unit])
+    return [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)], name
+
+
 def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
     found = []
     for row in rows:
@@ -337,7 +354,8 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
     for words in a column of sides that are none.
     """
     word, side_word, heading = _word(row, columns, what), _word(row, columns, reference), columns.angles.get(what)
-    if _O.search(word) or side_word.upper() == "O":
+    word = _WORD.sub(lambda match: side_letter(match[0], reference) or match[0], word)
+    if _O.search(word) or _O.search(side_word):
         if not columns.o_side:
             raise CaptureError(
                 f"{file}: line {row.number}: O is west (oeste, ouest, ovest) or east (Ost). Write W or E instead."
@@ -345,7 +363,9 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
         word, side_word = _O.sub(columns.o_side, word), _O.sub(columns.o_side, side_word)
     if word.count(",") == 1 and "." not in word:
         word = word.replace(",", ".")
-    side_word = _side(side_word, axis, f"{file}: line {row.number}") or (heading.side if heading is not None else "")
+    side_word = _side(side_word, reference, axis, f"{file}: line {row.number}") or (
+        heading.side if heading is not None else ""
+    )
     try:
         number = float(word)
         read: tuple[float, bool] | None = (number, False)
@@ -367,12 +387,14 @@ def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, fi
     return side[0] if side is not None and side[1] else read[0]
 
 
-def _side(word: str, axis: str, where: str) -> str:
+def _side(word: str, reference: str, axis: str, where: str) -> str:
     """N, S, E or W by the word of a column of sides; nothing where it is empty. Raises CaptureError."""
     if word.lower() in UNKNOWN:
         return ""
     positive, negative = ("N", "S") if axis == "latitude" else ("E", "W")
     for said in (word, word.split()[0]):  # `South latitude`
+        if letter := side_letter(said, reference):
+            return letter
         side = degrees_of_text(f"1 {said}", axis)
         if side is not None and side[1]:
             return positive if side[0] > 0 else negative
@@ -392,13 +414,14 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
     value = float(number[1].replace(",", "."))
     if value in NO_DATA:
         return math.nan
-    value *= behind.meters if behind.units else columns.altitude_unit or height_unit(columns.system)
+    value *= behind.meters if behind.units else columns.altitude_unit or columns.system_altitude_unit
     below = _BELOW.search(word[number.end() :]) or _BELOW.search(_word(row, columns, "altref"))
     return -abs(value) if below else value
 
 
-def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
-    change, system = to_geodetic(columns.system or "", file)
+def _projected(
+    rows: Sequence[Row], columns: _Columns, change: ToGeodetic, system: str, file: Path
+) -> list[tuple[float, float, float]]:
     places = []
     for row in rows:
         x, y = (number_of(_word(row, columns, what)) for what in ("x", "y"))
@@ -406,11 +429,9 @@ def _projected(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple
             words = [_word(row, columns, what) for what in ("x", "y", "alt")]
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
         places.append((x, y, _altitude(row, columns, file)))
-    if not places:
-        return []
     given = np.array(places)
     across = [in_units_of(columns.system or "", unit, file) for unit in columns.across_units]
-    given *= [*across, 1 / height_unit(columns.system)]
+    given *= [*across, 1 / columns.system_altitude_unit]
     known = np.isfinite(given[:, 2])
     changed = change(np.where(np.isfinite(given), given, 0.0))
     changed[~known, 2] = math.nan

@@ -11,7 +11,7 @@ import numpy as np
 
 from vdgs.captures.capture import Capture, View, spread_evenly
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.image_files import kept_fraction, pillow_without_limits, verify_image
+from vdgs.captures.image_files import kept_fraction, verify_image
 from vdgs.errors import CaptureError
 from vdgs.system.content_digests import find_copies
 
@@ -81,7 +81,7 @@ def check_images(
     if sample != "all":
         views = spread_evenly(views, max(sample, 1))
     checked: list[_CheckedView] = []
-    with pillow_without_limits(), ThreadPoolExecutor(NUM_DECODER_THREADS) as pool:
+    with ThreadPoolExecutor(NUM_DECODER_THREADS) as pool:
         for view in pool.map(_check_view, views):
             checked.append(view)
             if on_progress is not None:

@@ -337,7 +337,7 @@ def _decode_bytes(path: Path, data: np.ndarray) -> np.ndarray:
     if pixels is not None and pixels.ndim in (2, 3) and (pixels.ndim == 2 or pixels.shape[2] in (3, 4)):
         return pixels
     try:
-        with Image.open(io.BytesIO(data.tobytes())) as image:
+        with pillow_without_limits(), Image.open(io.BytesIO(data.tobytes())) as image:
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
     except MemoryError:
         raise
@@ -381,8 +381,7 @@ def verify_image(path: Path) -> VerifiedImage:
     try:
         if is_raw(path):
             return VerifiedImage(bool(np.ptp(develop(path))), False)
-        prepare_heif(path)
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if image.format in JPEGS and not has_end(path, image):
                 return _verify_without_end(path)
             if image.format in JPEGS:

@@ -65,10 +65,13 @@ _THOUSANDS = re.compile(
 _OTHERS = re.compile(
     r"yaw|pitch|roll|omega|phi|kappa|head|course|gimbal|speed|sat|time|date|std|rms|acc|err|dop|iso|focal|width|lat|lon"
 )
-#: Columns that hold the side of an angle alone.
+#: Words for sides, by the columns that hold them alone. O is east or west (`west_or_east`).
 _SIDE_WORDS = {
-    "latref": frozenset(["n", "s", "north", "south", "nord", "sud", "süd", "norte", "sur", "sul"]),
-    "lonref": frozenset(["e", "w", "o", "east", "west", "est", "ost", "ovest", "este", "oeste", "ouest"]),
+    what: {word: letter for letter, words in sides.items() for word in words.split()}
+    for what, sides in {
+        "latref": {"N": "n north nord norte", "S": "s south sud süd sur sul"},
+        "lonref": {"E": "e east est ost este", "W": "w west ovest oeste ouest", "O": "o"},
+    }.items()
 }
 #: Headings in German, where O is east, and in languages where it is west.
 _GERMAN = re.compile(r"^(?:breit|lang|laeng|hohe|hoehe|dateiname|bild)")
@@ -124,8 +127,18 @@ def with_sides(known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[
     found: dict[str, int] = {}
     for k in {*range(max(map(len, rows), default=0))} - {*known.values()}:
         values = {row[k].strip().lower() for row in rows if k < len(row)} - UNKNOWN
-        found |= {what: k for what, sides in _SIDE_WORDS.items() if values and values <= sides and what not in found}
+        found |= {
+            what: k
+            for what in _SIDE_WORDS
+            if what not in found and values and all(side_letter(value, what) for value in values)
+        }
     return {**found, **known} if len(found) == len(_SIDE_WORDS) else dict(known)
+
+
+def side_letter(word: str, what: str) -> str:
+    """The letter (N, S, E, W, or O) of a word for a side in a column of sides of latitudes (`latref`) or longitudes
+    (`lonref`); nothing for other words."""
+    return _SIDE_WORDS[what].get(word.strip(" .").lower(), "")
 
 
 def with_units(rows: list[Row]) -> list[Row]:

@@ -181,7 +181,7 @@ class OrthoRequest(ModelRequest):
     crs: str | None = None
     """Coordinates: EPSG:n, `enu`, `source` or `local`. EPSG:25832, `enu` (metres east and north of the scene's origin),
     `source` (those of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture,
-    else `local`."""
+    `source` where the capture is metres of a site's grid that was moved for precision, else `local`."""
     lod_error: Annotated[float | None, Range(0, MAX_RENDER_SIDE_PX)] = None
     """Draw through the run's level-of-detail tree (`vdgs lod`), at most so many pixels off. By default, and with 0,
     everything is drawn from all anchors."""
@@ -228,8 +228,9 @@ class ExportRequest(ModelRequest):
     fit in closed form. Needs 0.7 kB of memory for each Gaussian of degree 3."""
     crs: str | None = None
     """Coordinates of the files: EPSG:n, `enu` (metres east and north of the scene's origin), `source` (of the capture)
-    or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM for .laz and .las; else
-    `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
+    or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM for .laz and .las;
+    `source` where it is metres of a site's grid that was moved for precision; else `local`. 3D Tiles of a georeferenced
+    capture always stand on the globe (`enu`)."""
     background: Annotated[Path | None, Output()] = None
     """Also write sky and what is far away: an equirectangular PNG. Its middle looks east (+x), columns go clockwise.
     Files of Gaussians leave them out."""

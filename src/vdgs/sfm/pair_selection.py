@@ -107,14 +107,14 @@ def retrieval_pairs(
     for i in range(count) if len(words) else ():
         looks[i] = _vlad_descriptor(descriptors_of(i).astype(np.float32), words)
     known = np.flatnonzero(looks.any(axis=1))
-    asking = np.intersect1d(queries, known)
+    looks, asking = looks[known], np.flatnonzero(np.isin(known, queries))
     pairs = set()
     for start in range(0, len(asking), _LIKENESS_ROWS):
         rows = asking[start : start + _LIKENESS_ROWS]
-        likeness = looks[rows] @ looks[known].T
-        likeness[rows[:, None] == known] = -np.inf
+        likeness = looks[rows] @ looks.T
+        likeness[np.arange(len(rows)), rows] = -np.inf  # itself
         nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : min(NUM_RETRIEVED, len(known) - 1)]
-        pairs |= {_pair(int(i), int(j)) for i, row in zip(rows, known[nearest], strict=True) for j in row}
+        pairs |= {_pair(int(i), int(j)) for i, row in zip(known[rows], known[nearest], strict=True) for j in row}
     return pairs
 
 

@@ -166,11 +166,9 @@ def _is_finished(output: Path, key: str) -> bool:
 
 def _placed_before(output: Path, key: str) -> ReconstructionReport | None:
     """The facts of a capture of the same photographs that was finished, and is to be placed otherwise."""
-    if not (
-        (output / RECONSTRUCTION_FILE).is_file()
-        and (output / MAPPED).is_dir()
-        and Workspace(output).is_begun("capture", key)
-    ):
+    finished = Workspace(output)
+    is_capture = finished.is_done("capture", key) or finished.is_begun("capture", key)  # being placed anew
+    if not (is_capture and (output / RECONSTRUCTION_FILE).is_file() and (output / MAPPED).is_dir()):
         return None
     return read_reconstruction(output)
 
