@@ -157,8 +157,9 @@ def _whole_seconds(run: RunFolder, stages: Sequence[str], clock: Mapping[str, fl
     """
     if baseline_folder(run, tuple(stages)) is not None:
         evaluation = run.evaluation / EVALUATION_STATUS
-        measuring = read_json(evaluation)["seconds"] if evaluation.exists() else 0.0
-        return max(clock.get(stages[0], 0.0) - measuring, sum(loops))
+        if not evaluation.exists():  # nobody knows how much of the clock's time was measuring
+            return sum(loops)
+        return max(clock.get(stages[0], 0.0) - read_json(evaluation)["seconds"], sum(loops))
     partition, merged = run.partition_record().seconds, run.merged.status().merge_seconds
     noted = {"coarse": loops[0], "partition": partition or 0.0, "merge": merged or 0.0, "momentum-gs": sum(loops[1:])}
     whole = sum(max(clock.get(name, 0.0), noted[name]) for name in stages if name in noted)

@@ -326,10 +326,14 @@ def chunks():
 path = Path(os.environ["WRITTEN"])
 if path.name == "tileset.json":
     from vdgs.export.formats import tiles_3d as tiles
-    written = tiles.write_bytes
-    def write(file, content):
-        written(file, content)
+    from vdgs.system.atomic_files import write_atomic
+    written, files = tiles.write_bytes, []
+    def half(temporary):
+        temporary.write_bytes(b"half")
         os.kill(os.getpid(), signal.SIGKILL)
+    def write(file, content):
+        files.append(file)
+        return written(file, content) if len(files) == 1 else write_atomic(file, half)
     tiles.write_bytes = write
     tiles.write_tiles(path, ExportScene.of(random_gaussians(3000, 0)), max_gaussians=500)
 registry.write_scene(path, ExportScene(chunks=chunks(), count=6000, degree=0))

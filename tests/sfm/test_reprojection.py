@@ -55,6 +55,7 @@ def test_no_single_point_makes_the_mean_error():
     assert model.compute_mean_reprojection_error() > 1e100
     assert mean_reprojection_error(model) == pytest.approx((len(SEEN) * 0.5 + LARGEST_PX) / (len(SEEN) + 1))
     assert mean_reprojection_error(pycolmap.Reconstruction()) == 0
+    assert mean_reprojection_error(model_of(SEEN)) == 0  # not computed yet
 
 
 def test_points_without_observations_stay():

@@ -20,6 +20,8 @@ LEAST_RELIEF_M = 2.5
 #: Altitudes are heights over the ground where they spread by less than this share of what the photographs' heights do,
 #: and lie across those by so many times what up may be off by, and so many degrees (choice).
 ALIKE_SHARE, ACROSS_SIGMAS, ACROSS_DEG = 0.25, 3.0, 6.0
+#: Directions in which places spread by less than this share of how far they spread at most do not count (choice).
+SPREAD_ACROSS = 0.1
 
 
 def with_altitudes(altitudes: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -43,7 +45,8 @@ def are_over_ground(altitudes: np.ndarray, placed: np.ndarray, tilt_deg: float) 
     """Whether altitudes [n], nearly one for all, are heights over the ground, which a flight along a slope keeps: by
     places [n, 3] that do not depend on altitudes, whose up may be off by `tilt_deg` (one standard deviation)."""
     plane, missing = placed[:, :2] - placed[:, :2].mean(axis=0), placed[:, 2] - altitudes
-    slope = np.linalg.lstsq(plane, missing - missing.mean(), rcond=None)[0]
+    # Across a line nothing tells a slope.
+    slope = np.linalg.lstsq(plane, missing - missing.mean(), rcond=SPREAD_ACROSS)[0]
     across = np.degrees(np.arctan(np.linalg.norm(slope)))
     alike = np.std(altitudes) < ALIKE_SHARE * np.std(placed[:, 2])
     return bool(alike and across > max(ACROSS_DEG, ACROSS_SIGMAS * tilt_deg))

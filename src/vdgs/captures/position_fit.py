@@ -29,10 +29,10 @@ USUAL_M = (1.0, 2.0)
 DRIFT_COSTS, UNUSED_COSTS = 4.0, 8.0
 #: Where the receiver states its accuracy, so many times more; it is believed up to so many times what it states.
 STATED_TIMES, BELIEVED = 5.0, 3.0
-#: Altitudes of a receiver that states no accuracy may step once in a flight, as with another battery, by so many times
-#: what they differ by from photograph to photograph, and by so many metres (one standard deviation; choice), or so many
-#: times what positions differ by across where that is less: of a better receiver.
-UNSEEN_STEP, UNSEEN_STEP_M, UNSEEN_STEP_ACROSS = 1.5, 1.75, 4.0
+#: Altitudes of a receiver that states no accuracy may step once in a flight, as with another battery, by so many metres
+#: (one standard deviation; choice), or so many times what positions differ by across where that is less: of a better
+#: receiver.
+UNSEEN_STEP_M, UNSEEN_STEP_ACROSS = 1.75, 4.0
 #: The weight of altitudes that are not used: their mean alone counts.
 UNUSED_TIMES = 1e5
 #: Residuals that follow each other alike count as if there were fewer of them, by this factor at most.
@@ -385,7 +385,7 @@ def _with_unseen_step(
     if problem.stated is not None or gains.shape[1] < ENOUGH_TO_DOUBT:
         return level_deg
     after = np.cumsum(gains[1:3, ::-1, 2], axis=1)
-    step_m = max(UNSEEN_STEP * gps_std[2], min(UNSEEN_STEP_M, UNSEEN_STEP_ACROSS * gps_std[:2].mean()))
+    step_m = min(UNSEEN_STEP_M, UNSEEN_STEP_ACROSS * float(gps_std[:2].mean()))
     step = 2 * float(step_m * np.linalg.norm(after, axis=0).max())
     most = float(np.degrees(np.linalg.norm(_tilt(state.rotation @ problem.up.direction))))
     most = most + 2 * problem.up.deviation_deg if problem.up.sure else 180.0

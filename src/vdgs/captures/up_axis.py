@@ -135,14 +135,23 @@ def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) 
     mean = -rotations[:, 2].mean(axis=0)
     if np.linalg.norm(mean) < LOOKS_DOWN or how.startswith("level"):
         return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
-    mean = mean / np.linalg.norm(mean)
+    length = float(np.linalg.norm(mean))
+    mean = mean / length
     if UPPER_SIDES in how:  # level at a wall, or nearly so: all views are one, but not down
         return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
     if up @ mean < np.cos(np.radians(AGREE_DEG)):  # a slope, or a lone oblique look: the views are nearer to the truth
         apart = float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1))))
-        turned = np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[1] < TURNED
-        return mean, VIEWS_DEG if turned else max(VIEWS_DEG, apart / 2), bool(up @ mean > 0)
+        left = float(np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[1])
+        doubt = min(_lean_deg(length, left), apart / 2) if left < TURNED else apart / 2
+        return mean, max(VIEWS_DEG, doubt), bool(up @ mean > 0)
     one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
     middle = up + (1 if one_way else 2) * mean
     deviation = UNCERTAIN_DEG if doubts and one_way else VIEWS_DEG * (2 if one_way else 1)  # maybe level at a wall
     return middle / np.linalg.norm(middle), deviation, not doubts
+
+
+def _lean_deg(length: float, left: float) -> float:
+    """By how much the mean view leans, in degrees, where cameras that are tilted alike turn about up: `length` is that
+    of the mean of their unit views, `left` what is left of the mean of those across up (1: no turn, 0: all around)."""
+    across = float(np.sqrt((1 - length**2) / max(1 - left**2, 1e-9)))  # the sine of the tilt
+    return float(np.degrees(np.arctan2(left * across, np.sqrt(max(0.0, 1 - across**2)))))

@@ -43,6 +43,8 @@ MIN_SPREAD_SIGMAS = 3.0
 MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
 #: Altitudes along a line that change so many times their error against what is known of up are worth a note (choice).
 MUCH_DRIFT = 4.0
+#: Altitudes of receivers drift by no more than this in a flight, in metres (choice).
+MOST_DRIFT_M = 20.0
 ADVICE_WRITE_GPS = (
     "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
     "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
@@ -299,7 +301,8 @@ def _checked_reading(
     across, up = fit.place_error_m
     note = (
         f"the altitudes ({positions.source}) differ between the photographs as altitudes do that are {what}: heights "
-        f"above the sea may be off by {two_digits(off)} m. A table of positions (--gps) mends it."
+        f"above the sea may be off by {two_digits(off)} m. "
+        + ("A table of positions (--gps) mends it." if positions.source == "EXIF" else "Mend the table.")
     )
     return replace(fit, place_error_m=(across, up + off)), [note]
 
@@ -311,8 +314,10 @@ def _checked_on_a_line(fit: PositionFit, problem: Problem) -> tuple[PositionFit,
         return fit, []
     apart = fit.placed[:, 2] - fit.placed @ fit.similarity.rotation @ problem.up.direction
     drift, (across, up) = float(np.ptp(apart[fit.inliers])), fit.place_error_m
-    found = replace(fit, place_error_m=(across, up + drift / 2))
-    if drift < MUCH_DRIFT * up:
+    length = float(np.ptp(fit.placed[fit.inliers, :2], axis=0).max())
+    is_explained = drift <= 2 * np.tan(np.radians(problem.up.deviation_deg)) * length  # by up alone
+    found = replace(fit, place_error_m=(across, up + (min(drift, MOST_DRIFT_M) if is_explained else drift) / 2))
+    if drift < MUCH_DRIFT * up or (is_explained and drift > MOST_DRIFT_M):
         return found, []
     note = (
         f"along the one line of the flight the recorded altitudes change by {two_digits(drift)} m against what "

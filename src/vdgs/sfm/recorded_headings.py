@@ -17,7 +17,8 @@ from vdgs.system.units import two_digits
 ENOUGH_HEADINGS, ALIKE, OTHER_WAY_DEG = 5, 0.95, 150.0
 #: Headings contradict the positions where they differ by so many degrees more than north may be off (choice).
 APART_DEG = 3.0
-#: Positions may lag behind the photographs by so many metres along the track: as shutters wait (choice).
+#: Positions may lie so many metres behind or ahead of the photographs along the track: as shutters wait, or positions
+#: are written late (choice).
 MOST_LAG_M = 5.0
 
 
@@ -27,8 +28,8 @@ def checked_by_headings(
     """The fit with north and scale as uncertain as recorded headings show, and notes. `taken` are the photographs of
     the fit's positions, `times` [n] when they were taken.
 
-    Positions that lag along the track turn an orbit, but no strips flown back and forth: only where such a lag explains
-    what headings and positions differ by is north that uncertain. Else the compass is taken to be off.
+    Positions that lag, or run ahead, along the track turn an orbit, but no strips flown back and forth: only where that
+    explains what headings and positions differ by is north that uncertain. Else the compass is taken to be off.
     """
     away = _turned(fit, images, taken)
     if away is None:
@@ -44,8 +45,8 @@ def checked_by_headings(
         return fit, []
     note = (
         f"north by the positions is turned by {two_digits(abs(away))}° from the recorded headings, as it would be by "
-        f"positions that lag {two_digits(lag)} m along the track: which of the two is right is not known, and north is "
-        "stated no better."
+        f"positions that lie {two_digits(lag)} m behind or ahead along the track: which of the two is right is not "
+        "known, and north is stated no better."
     )
     return replace(fit, north_error_deg=abs(away) + fit.north_error_deg, scale_error=fit.scale_error + scale), [note]
 
@@ -66,8 +67,8 @@ def _turned(fit: PositionFit, images: Mapping[str, pycolmap.Image], taken: Seque
 
 
 def _lag(fit: PositionFit, times: np.ndarray, turn_deg: float) -> tuple[float, float]:
-    """How far positions must lie behind, along the track, to turn the scene so far, in metres, and by what share that
-    changes its scale."""
+    """How far positions must lie behind or ahead, along the track, to turn the scene so far, in metres, and by what
+    share that changes its scale."""
     order = np.argsort(times, kind="stable")
     places = in_plane(fit.placed[order])
     along = np.gradient(places)

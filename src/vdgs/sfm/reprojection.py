@@ -14,7 +14,8 @@ LARGEST_PX = 100.0
 def mean_reprojection_error(model: pycolmap.Reconstruction) -> float:
     """Mean distance in pixels from where photographs show points to where the model has them, each point's at most
     `LARGEST_PX`; by the errors that the model holds (`update_point_3d_errors`). 0 without observations."""
-    errors = np.array([point.error for point in model.points3D.values() if point.track.length()])
+    found = (point.error for point in model.points3D.values() if point.track.length())
+    errors = np.array([error for error in found if error >= 0])  # it is -1 until it is computed
     return float(np.where(errors < LARGEST_PX, errors, LARGEST_PX).mean()) if len(errors) else 0.0
 
 

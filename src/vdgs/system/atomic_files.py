@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 FULL_DISK_BYTES = 1 << 20
 
 
+#: How the names of temporary files end (regular expression).
+TEMPORARY_ENDING = r"\.[0-9a-f]{6}-[0-9]+\.tmp"
+
+
 def process_mark() -> str:
     """What the names of temporary files carry of the process that writes them: a mark of its machine, and its number
     there."""
@@ -33,7 +37,11 @@ def process_mark() -> str:
 
 
 def host_mark() -> str:
-    return hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+    """A mark of this machine, and of the container on it whose processes are counted by themselves."""
+    counted = platform.node()
+    with suppress(OSError):  # Linux alone has it
+        counted += os.readlink("/proc/self/ns/pid")
+    return hashlib.sha256(counted.encode()).hexdigest()[:6]
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:

@@ -19,7 +19,7 @@ from vdgs.export.formats.html import default_page_view, length_factor, packed_ro
 from vdgs.export.formats.tile_quadtree import build_tile_quadtree
 from vdgs.export.formats.tiles_3d import named_tiles
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.atomic_files import TEMPORARY_ENDING, write_bytes
 from vdgs.system.documents import JsonObject
 
 SCENE_FILE, PAGE_FILE = "scene.json", "index.html"
@@ -31,7 +31,7 @@ _PAGE = Path(__file__).with_name("streamed_page.html")
 _OURS = '<meta name="generator" content="vdgs">'
 #: Lengths are chosen by so many Gaussians.
 _SAMPLE = 1 << 17
-NODE_FOLDER = FileFolder("nodes", re.compile(r"[0-3]+\.bin|\.[0-3]+\.bin\.[0-9]+\.tmp"), named_tiles)
+NODE_FOLDER = FileFolder("nodes", re.compile(r"[0-3]+\.bin|\.[0-3]+\.bin" + TEMPORARY_ENDING), named_tiles)
 
 
 def check_page_folder(path: Path, scene: ExportScene) -> None:

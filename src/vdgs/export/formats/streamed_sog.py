@@ -25,6 +25,7 @@ from vdgs.export.formats.sog import MAX_SH_CENTROIDS, fit_palette, write_sog_fol
 from vdgs.kernels import get_backend
 from vdgs.model.gaussian_merging import merge_to
 from vdgs.model.gaussians import Gaussians
+from vdgs.system.atomic_files import TEMPORARY_ENDING
 from vdgs.system.documents import JsonObject
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -160,5 +161,5 @@ def _named_files(path: Path) -> list[str]:
 
 
 LOD_FOLDER = FileFolder(
-    "lod", re.compile(r"[0-9]+_[0-9]+/\.?(meta\.json|[A-Za-z0-9_]+\.webp)(\.[0-9]+\.tmp)?"), _named_files
+    "lod", re.compile(rf"[0-9]+_[0-9]+/\.?(meta\.json|[A-Za-z0-9_]+\.webp)({TEMPORARY_ENDING})?"), _named_files
 )

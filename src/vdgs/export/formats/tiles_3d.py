@@ -23,7 +23,7 @@ from vdgs.export.formats.tile_quadtree import TilesetNode, build_tile_quadtree
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.model.gaussian_transform import transform_gaussians
 from vdgs.model.gaussians import Gaussians
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.atomic_files import TEMPORARY_ENDING, write_bytes
 from vdgs.system.documents import JsonObject
 
 TILESET_FILE = "tileset.json"
@@ -80,7 +80,7 @@ def named_tiles(path: Path) -> list[str]:
 
 
 #: A tile's name says where in the quadtree it stands.
-TILE_FOLDER = FileFolder("tiles", re.compile(r"[0-3]+\.glb|\.[0-3]+\.glb\.[0-9]+\.tmp"), named_tiles)
+TILE_FOLDER = FileFolder("tiles", re.compile(r"[0-3]+\.glb|\.[0-3]+\.glb" + TEMPORARY_ENDING), named_tiles)
 
 
 def _tileset(root: TilesetNode, metadata: ExportMetadata) -> JsonObject:
