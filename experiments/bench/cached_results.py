@@ -43,6 +43,8 @@ def _result(plain: Mapping[str, Any]) -> BenchResult:
     result = BenchResult(**{each.name: plain[each.name] for each in fields(BenchResult)})
     if not result.key or not isinstance(result.figures["psnr"], float):
         raise ValueError("a run without key or figures")
+    if "preparation_seconds" not in result.figures:  # its seconds would stand beside others of another meaning
+        raise ValueError("a run whose seconds are those of its steps alone")
     return replace(result, groups=tuple(result.groups), frusta=tuple(result.frusta))
 
 

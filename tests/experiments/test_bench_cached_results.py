@@ -134,6 +134,15 @@ def test_a_file_of_another_kind_is_named(tmp_path, content):
         read_cached_results([file])
 
 
+def test_seconds_of_another_meaning_do_not_stand_beside_others(there, tmp_path):
+    content = json.loads(there.read_text())
+    for each in content["results"]:
+        del each["figures"]["preparation_seconds"]
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    with pytest.raises(VdgsError, match="seconds are those of its steps alone"):
+        read_cached_results([tmp_path / "results.json"])
+
+
 def test_groups_of_other_pixels_are_not_compared(there):
     first, second = read_cached_results([there]).values()
     groups = tuple({"lower": 1, "upper": 2, "pixels": pixels} for pixels in (10, 12))
