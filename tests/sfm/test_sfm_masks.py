@@ -253,8 +253,9 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     model = incremental_mapper.read_models(work)[0]
     write_mask(output / "masks/old.png", left_half())  # of other masks
     reconstruct._write(prepared, work, model, model, "key", console())
-    lenses = {number: lens.intrinsics for number, lens in reconstruct._lenses(model, 200).items()}
-    reconstruct.capture_writer.write_model(output, model, lenses)
+    writer, lenses = reconstruct.capture_writer, reconstruct._lenses(model)
+    pinholes = {number: writer.make_undistortion(lens, 200).intrinsics for number, lens in lenses.items()}
+    writer.write_model(output, model, pinholes)
     capture = load_capture(output)
     names = {view.name: view.mask_path and view.mask_path.name for view in capture.views}
     assert names == {name: f"{name}.png" if k < 2 else None for k, name in enumerate(masked.names)}

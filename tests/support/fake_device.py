@@ -168,6 +168,10 @@ class Told(TorchFunctionMode):
         if func is Tensor.tolist and self.memory.holds(args[0]):
             self.memory.wait("tolist")
         device = kwargs.get("device")
+        if (
+            device is not None and func is torch.as_tensor and isinstance(args[0], Tensor)
+        ):  # a copy, if it lies elsewhere
+            return self._to(args[0], **kwargs)
         if device is not None and torch.device(device).type == "cuda" and func in FROM_NUMBERS:
             self.memory.wait(func.__name__)
         if device is not None and torch.device(device).type == "cuda":

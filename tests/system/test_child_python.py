@@ -60,7 +60,7 @@ def test_a_child_has_the_folder_where_its_parent_has(folder, options, tmp_path):
 
 
 def test_a_child_of_a_checkout_finds_it(tmp_path):
-    """Nothing names the package but the current folder, as in a checkout that is not installed."""
+    """Nothing names the package but the current folder, as in a checkout that is not installed (-S: as this may be)."""
     package = tmp_path / "vdgs"
     (package / "system").mkdir(parents=True)
     for name in ("__init__.py", "system/__init__.py"):
@@ -69,7 +69,7 @@ def test_a_child_of_a_checkout_finds_it(tmp_path):
     (package / "system" / "child_python.py").write_text(source.read_text())
     (package / "__main__.py").write_text(PARENT.replace("json.tool", "vdgs.told"))
     (package / "told.py").write_text("print(__file__)")
-    done = run([sys.executable, "-m", "vdgs"], tmp_path, PYTHONPATH="")
+    done = run([sys.executable, "-S", "-m", "vdgs"], tmp_path, PYTHONPATH="")
     assert done.stdout.strip() == str(package / "told.py"), done.stderr
 
 
