@@ -206,6 +206,48 @@ def test_positions_without_altitudes_tell_scale_and_north(wrong_m, count):
     assert tilt_deg(fit, turn) <= fit.level_error_deg
 
 
+@pytest.mark.parametrize("altitudes", ["none", "useless"])
+@pytest.mark.parametrize(("count", "each"), [(2, 10), (6, 10)])
+def test_chance_in_the_plane_does_not_tilt_what_attitudes_or_views_level(altitudes, count, each):
+    """A tilt of 3 degrees shortens a flight by 0.1 %, as errors of positions do: level stays as it was known."""
+    within = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        places = strips(count, each, 20.0, rng)
+        recorded = places + rng.normal(0, 0.8, places.shape)
+        if altitudes == "useless":
+            recorded[:, 2] += 80 * np.sin(np.pi * np.linspace(0, 1, len(places)))
+        problem, turn = problem_of(places, recorded, seed, 3.0)
+        known = float(np.degrees(np.arccos((turn @ problem.up.direction)[2])))
+        fit = fit_positions(replace(problem, has_altitudes=altitudes != "none"))
+        assert fit.altitude == ("none" if altitudes == "none" else "drifts")
+        assert tilt_deg(fit, turn) == pytest.approx(known, abs=0.1)
+        assert fit.level_error_deg >= 2.4 * 3.0
+        within.append(abs(fit.similarity.scale / SCALE - 1) <= fit.scale_error)
+    assert np.mean(within) >= 0.8
+
+
+def test_many_positions_in_the_plane_contradict_attitudes_or_views_that_are_far_off():
+    """Up told 12 degrees off shortens a level flight by 2 %; where up is told along a slope, the slope may fall to
+    either side, and level is stated no better than that."""
+    rng = np.random.default_rng(1)
+    places = strips(12, 20, 20.0, rng)
+    off = Up(np.array([np.sin(np.radians(12)), 0, np.cos(np.radians(12))]), 3.0, "the views")
+    times = np.linspace(0, 1, len(places))
+    problem = Problem(
+        centers=places / SCALE, targets=places + rng.normal(0, 0.8, places.shape), times=times, up=off,
+        has_altitudes=False,
+    )  # fmt: skip
+    assert tilt_deg(fit_positions(problem), np.eye(3)) < 4
+    slope = places * [1, 1, 0] + np.outer(np.tan(np.radians(15)) * places[:, 0], [0, 0, 1])
+    normal = Up(np.array([-np.sin(np.radians(15)), 0, np.cos(np.radians(15))]), 3.0, "the views")
+    fit = fit_positions(replace(problem, centers=slope / SCALE, targets=slope + rng.normal(0, 0.8, slope.shape)))
+    assert tilt_deg(fit, np.eye(3)) <= fit.level_error_deg
+    along = replace(problem, centers=slope / SCALE, targets=slope + rng.normal(0, 0.8, slope.shape), up=normal)
+    fit = fit_positions(along)
+    assert 13 < tilt_deg(fit, np.eye(3)) <= fit.level_error_deg + 1
+
+
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_few_positions_are_not_judged_as_strictly_as_many(count):
     """An exact fit of three says little: their errors are as large as few make them, and altitudes do not tilt them."""
