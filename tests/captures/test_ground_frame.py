@@ -203,6 +203,54 @@ def test_gps_without_altitudes_places_in_the_plane(tmp_path):
     assert np.ptp(offset, axis=0).max() < 1  # turned by less than what the views are off by
 
 
+@pytest.mark.parametrize("of", ["frame_{}.png", "frame_{:03d}.png"])
+def test_altitudes_drift_in_the_order_of_the_photographs_numbers(tmp_path, of):
+    """Captures list photographs by the letters of their names: frame_10 before frame_2."""
+    truth = at_several_heights()
+    cameras = list(truth.cameras.values())
+    named = {of.format(k + 1): camera for k, camera in enumerate(cameras)}
+    renamed = replace(truth, cameras=dict(sorted(named.items())))
+    drift = dict(zip(named, np.linspace(0, 30, len(named)).tolist(), strict=True))
+    header, *rows = write_gps(tmp_path / "gps.csv", renamed, noise=0.02).read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    drifting = [",".join([*c[:-1], repr(float(c[-1]) + drift[c[0].lower().replace("jpg", "png")])]) for c in cells]
+    (tmp_path / "gps.csv").write_text("\n".join([header, *drifting]))
+    frame, warnings = ground_of(renamed, tmp_path, gps=tmp_path / "gps.csv")
+    assert any("drift" in warning for warning in warnings)
+    assert np.degrees(np.arccos(frame.rotation[2, 2])) < 3
+    assert frame.scale == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("altitudes", [True, False])
+def test_positions_of_a_receiver_without_satellites_are_left_out(tmp_path, altitudes):
+    """Also where they are most of all: 0, 0, 0 in a table."""
+    truth = at_several_heights()
+    header, *rows = write_gps(tmp_path / "gps.csv", truth, noise=0.02).read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    lost = len(cells) // 2 + 1
+    cells = [[*c[:2], "0", "0", "0"] if 1 < k <= 1 + lost else c for k, c in enumerate(cells)]
+    keep = slice(None) if altitudes else slice(4)
+    (tmp_path / "gps.csv").write_text("\n".join(",".join(c[keep]) for c in [header.split(","), *cells]))
+    frame, warnings = ground_of(truth, tmp_path, gps=tmp_path / "gps.csv")
+    assert frame.origin_geo[:2] == pytest.approx(ORIGIN[:2], abs=1e-3)
+    assert frame.scale == pytest.approx(1, abs=0.05)
+    assert any("the position is 0, 0" in warning for warning in warnings)
+    (tmp_path / "gps.csv").write_text("\n".join([header, *(",".join([*c[:2], "0", "0", "0"]) for c in cells)]))
+    frame, warnings = ground_of(truth, tmp_path, gps=tmp_path / "gps.csv")
+    assert not frame.metric
+    assert any("the position is 0, 0" in warning for warning in warnings)
+
+
+def test_positions_that_do_not_spread_tell_no_scale(tmp_path):
+    truth = at_several_heights()
+    header, *rows = write_gps(tmp_path / "gps.csv", truth).read_text().splitlines()
+    same = [",".join([*row.split(",")[:2], "47.1", "8.1", str(500 + k % 2)]) for k, row in enumerate(rows)]
+    (tmp_path / "gps.csv").write_text("\n".join([header, *same]))
+    frame, warnings = ground_of(truth, tmp_path, gps=tmp_path / "gps.csv")
+    assert not frame.metric
+    assert any("within 2 m of each other" in warning for warning in warnings)
+
+
 def table_of(file, scene, altitude_of):
     """A table of the cameras' positions, with altitudes that are a function of the true ones."""
     header, *rows = write_gps(file, scene).read_text(encoding="utf-8").splitlines()

@@ -13,7 +13,9 @@ import numpy as np
 from vdgs.captures.gps_altitudes import with_altitudes, without_zero_altitudes
 from vdgs.captures.gps_tables import GpsRow, check_geodetic, read_gps_table
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
+from vdgs.captures.odd_positions import are_far_off, are_nowhere
 from vdgs.errors import CaptureError
+from vdgs.system.units import first_names
 
 #: What georef.json calls a world that has its place on Earth, and one that only has metres and up.
 ENU_FRAME, LOCAL_FRAME = "ENU, metres, x east y north z up", "local, metres, z up; no place on Earth"
@@ -105,18 +107,31 @@ class GpsPositions:
 
 
 def match_gps(names: Sequence[str], file: Path) -> GpsPositions:
-    """The positions of those images that a table has one of.
+    """The positions of those images that a table has one of, without those at 0, 0 and those far from all others.
 
     Raises `CaptureError` as `read_gps_table` and `match_rows` do.
     """
     table = read_gps_table(file)
     found = match_rows(names, table.rows, file, table.numbered)
-    positions, every = np.array([row.position for row in found.values()]).reshape(-1, 3), np.ones(len(found), bool)
-    positions = without_zero_altitudes(positions, every)
-    kept, has_altitudes = with_altitudes(positions[:, 2], every)
+    positions, notes = np.array([row.position for row in found.values()]).reshape(-1, 3), [*table.notes]
+
+    def name_unused(which: np.ndarray, why: str) -> None:
+        if which.any():
+            unused = first_names([names[image] for image, named in zip(found, which, strict=True) if named])
+            notes.append(f"{file.name}: {unused}: the position {why}; not used.")
+
+    nowhere = are_nowhere(positions)
+    name_unused(nowhere, "is 0, 0 (no satellites yet)")
+    known = ~nowhere
+    if known.any():
+        far = known & are_far_off(positions, known)
+        name_unused(far, "is far from all others")
+        known &= ~far
+    positions = without_zero_altitudes(positions, known)
+    kept, has_altitudes = with_altitudes(positions[:, 2], known)
     positions = np.where([True, True, has_altitudes], positions, 0.0)
     images = np.array(list(found), int)[kept]
-    return GpsPositions(images, positions[kept], has_altitudes, table.notes, table.datum_error_m)
+    return GpsPositions(images, positions[kept], has_altitudes, tuple(notes), table.datum_error_m)
 
 
 def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbered: bool = False) -> dict[int, GpsRow]:

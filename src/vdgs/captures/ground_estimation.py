@@ -17,16 +17,19 @@ so z = 0 is the median height of the ground; where metres are unknown the median
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from vdgs.captures.camera_height import view_distance
+from vdgs.captures.capture_order import natural_key
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
 from vdgs.captures.georeference import Georef, match_gps, read_georef
 from vdgs.captures.gps_altitudes import refuse_unit, wrong_unit
 from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
+from vdgs.captures.odd_positions import MIN_SPREAD_M, do_not_spread
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
 from vdgs.captures.reconstruction import by_axis
@@ -223,8 +226,6 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     positions = match_gps(scene.names, file)
     indices, geodetic, has_altitudes = positions.images, positions.geodetic, positions.has_altitudes
     warnings += positions.notes
-    origin = median_place(geodetic)
-    enu = enu_from_geodetic(geodetic, origin)
     centers = scene.centers[indices]
     if is_collinear(centers):
         warnings.append(
@@ -232,8 +233,16 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             "fix no up axis; the frame is estimated from the cameras instead and is not metric."
         )
         return None
+    origin = median_place(geodetic)
+    enu = enu_from_geodetic(geodetic, origin)
+    if do_not_spread(enu):
+        warnings.append(
+            f"{file.name}: all {len(indices)} positions are within {MIN_SPREAD_M:g} m of each other, and tell neither "
+            "scale nor north; the frame is estimated from the cameras instead and is not metric."
+        )
+        return None
     direction, deviation, sure = up_by_views(scene.centers, scene.rotations, scene.points)
-    times = np.linspace(0, 1, len(indices))
+    times = _taken_in_order([scene.names[i] for i in indices])
     up = Up(direction, deviation, "the views", sure)
     problem = Problem(centers=centers, targets=enu, times=times, up=up, has_altitudes=has_altitudes)
     others = {"east and north": enu[:, [1, 0, 2]], "signs": enu * [-1.0, 1.0, 1.0]}
@@ -278,6 +287,14 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         frame = replace(frame, origin_geo=(*frame.origin_geo[:2], 0.0))
     _compare_up(scene, frame, warnings)
     return frame
+
+
+def _taken_in_order(names: Sequence[str]) -> np.ndarray:
+    """When photographs were taken, 0 to 1 [n], as far as their names tell: frame_2 before frame_10, in whatever order a
+    capture lists them."""
+    times = np.empty(len(names))
+    times[sorted(range(len(names)), key=lambda k: natural_key(names[k]))] = np.linspace(0, 1, len(names))
+    return times
 
 
 def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:

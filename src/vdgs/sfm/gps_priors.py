@@ -11,20 +11,15 @@ import numpy as np
 from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_altitudes import refuse_unit, with_altitudes, without_zero_altitudes, wrong_unit
 from vdgs.captures.gps_tables import GpsRow, read_gps_table
+from vdgs.captures.odd_positions import MIN_SPREAD_M, are_far_off, are_nowhere, do_not_spread
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
 from vdgs.sfm.flights import STEP_M, flights_of
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
 
-#: Positions nearer than this to 0, 0 (degrees) are a receiver without satellites.
-NULL_POSITION_DEG = 0.01
-#: A position so many times farther from the middle than the median one, and so many metres, is another flight's.
-OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
 #: A table whose positions are this near to those in the photographs is of the same flight (degrees).
 SAME_FLIGHT_DEG = 0.05
-#: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
-MIN_SPREAD_M = 2.0
 #: Altitudes of a table that lie so far from those of the photographs (metres) are told: as far as a datum is off in few
 #: places, and nearer than heights over the ground are to those over the sea (choice).
 TOLD_ALTITUDE_M = 20.0
@@ -109,12 +104,12 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     geodetic, notes = recorded.geodetic, recorded.notes
     names = [photo.name for photo in photographs]
     known = np.isfinite(geodetic[:, :2]).all(axis=1)
-    nowhere = known & (np.abs(geodetic[:, :2]) < NULL_POSITION_DEG).all(axis=1)
+    nowhere = known & are_nowhere(geodetic)
     if nowhere.any():
         notes.append(f"{_some(names, nowhere)}: the position is 0, 0 (no satellites yet); not used.")
     known &= ~nowhere
     if known.any():
-        far = known & _outliers(geodetic, known)
+        far = known & are_far_off(geodetic, known)
         if far.any():
             notes.append(f"{_some(names, far)}: the position is far from all others; not used.")
         known &= ~far
@@ -122,7 +117,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     index = np.flatnonzero(kept)
     origin = _origin(geodetic[index])
     enu = enu_from_geodetic(geodetic[index], origin) if len(index) else np.zeros((0, 3))
-    if len(index) >= MIN_POSITIONS and np.ptp(enu[:, :2], axis=0).max() < MIN_SPREAD_M:
+    if len(index) >= MIN_POSITIONS and do_not_spread(enu):
         radians = table is not None and (np.abs(geodetic[index, :2]) < [np.pi / 2, np.pi]).all()
         notes.append(
             f"all {len(index)} positions are within {MIN_SPREAD_M:g} m of each other: they tell neither scale nor "
@@ -288,21 +283,6 @@ def _unmatched(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], table: Path)
     if not spare:
         return []
     return [f"{table.name}: {len(spare)} rows are of photographs that are not there; left out ({first_names(spare)})."]
-
-
-def _outliers(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Positions that cannot be of this flight, [n] bool."""
-    level = geodetic.copy()
-    heights = geodetic[known & np.isfinite(geodetic[:, 2]), 2]
-    level[:, 2] = np.where(np.isfinite(geodetic[:, 2]), geodetic[:, 2], np.median(heights) if len(heights) else 0.0)
-    altitudes = level[known, 2]
-    enu = enu_from_geodetic(level, median_place(level[known]))
-    across = np.linalg.norm(enu[:, :2], axis=1)
-    up = np.abs(level[:, 2] - np.median(altitudes))
-    with np.errstate(invalid="ignore"):
-        return (across > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(across[known])))) | (
-            up > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(up[known])))
-        )
 
 
 def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:

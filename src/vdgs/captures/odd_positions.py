@@ -1,0 +1,40 @@
+"""Positions that are none of the flight: a receiver without satellites, another flight, one that never moved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vdgs.geometry.geodesy import enu_from_geodetic, median_place
+
+#: Positions nearer than this to 0, 0 (degrees) are a receiver without satellites.
+NULL_POSITION_DEG = 0.01
+#: A position so many times farther from the middle than the median one, and so many metres, is another flight's.
+OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
+#: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
+MIN_SPREAD_M = 2.0
+
+
+def are_nowhere(geodetic: np.ndarray) -> np.ndarray:
+    """Which positions [n, 3] (degrees, metres) are 0, 0, [n] bool."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(geodetic[:, :2]) < NULL_POSITION_DEG).all(axis=1))
+
+
+def are_far_off(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Which positions [n, 3] (degrees, metres) cannot be of the flight of the `known` ones [n] bool, [n] bool."""
+    level = geodetic.copy()
+    heights = geodetic[known & np.isfinite(geodetic[:, 2]), 2]
+    level[:, 2] = np.where(np.isfinite(geodetic[:, 2]), geodetic[:, 2], np.median(heights) if len(heights) else 0.0)
+    altitudes = level[known, 2]
+    enu = enu_from_geodetic(level, median_place(level[known]))
+    across = np.linalg.norm(enu[:, :2], axis=1)
+    up = np.abs(level[:, 2] - np.median(altitudes))
+    with np.errstate(invalid="ignore"):
+        return (across > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(across[known])))) | (
+            up > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(up[known])))
+        )
+
+
+def do_not_spread(enu: np.ndarray) -> bool:
+    """Whether positions [n, 3] in metres are all one and the same across."""
+    return not len(enu) or bool(np.ptp(enu[:, :2], axis=0).max() < MIN_SPREAD_M)
