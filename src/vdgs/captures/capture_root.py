@@ -17,4 +17,6 @@ def capture_root(path: Path) -> Path:
     if path.parts[-3:-1] == _PIX4D_INNER:
         return path.parents[2]
     inner = path.parent.name in _INNER and not (path.parent / "images").is_dir()
-    return path.parent.parent if inner and (path.parent.parent / "images").is_dir() else path.parent
+    above = path.parent.parent
+    listed = (above / "list.txt").is_file() and not (path.parent / "list.txt").is_file()  # as Bundler itself leaves it
+    return above if inner and ((above / "images").is_dir() or listed) else path.parent

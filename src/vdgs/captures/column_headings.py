@@ -137,10 +137,11 @@ def read_heading(text: str) -> Heading:
 
 def meanings_of(letters: str) -> list[str] | None:
     """The meanings of the words that letters are made of, the longest first; None where they are made of others."""
-    if not letters:
-        return []
-    for length in range(min(_LONGEST, len(letters)), 0, -1):
-        meaning = _WORDS.get(letters[:length])
-        if meaning is not None and (rest := meanings_of(letters[length:])) is not None:
-            return [meaning, *rest]
-    return None
+    behind: list[list[str] | None] = [None] * len(letters) + [[]]  # what the letters from each place on mean
+    for start in reversed(range(len(letters))):
+        for end in range(min(start + _LONGEST, len(letters)), start, -1):
+            meaning, rest = _WORDS.get(letters[start:end]), behind[end]
+            if meaning is not None and rest is not None:
+                behind[start] = [meaning, *rest]
+                break
+    return behind[0]

@@ -39,6 +39,8 @@ _ONE_PLACE = 0.2
 #: What is said of systems in feet, where nothing says the unit of heights.
 HEIGHTS_IN_METERS = "; x and y in feet, heights are taken as metres"
 _ALL_IN_FEET = "; x, y and heights in feet"
+#: What is said of heights above a geoid whose grid is not at hand.
+WITHOUT_GEOID = "; heights as they are, for PROJ lacks the grid of their geoid"
 #: National datums of which nothing more is known differ from WGS 84 by up to so many metres.
 UNKNOWN_DATUM_M = 300.0
 #: A datum that moves places by less (degrees) is WGS 84 for PROJ.
@@ -91,11 +93,11 @@ def join_definition(lines: Sequence[str]) -> tuple[str, int]:
 
 
 def to_geodetic(
-    header: str, file: Path, where: str = "the first line", *, heights_as_xy: bool = False
+    header: str, file: Path, where: str = "the first line", *, heights_as_xy: bool = False, own_axes: bool = False
 ) -> tuple[ToGeodetic, str]:
-    """What brings x, y, z [n, 3] (x east or longitude) to latitude, longitude and height, and the name of their system,
-    which `header` names; `where` that stands in the file. Where the system has no heights, z is metres, or
-    `heights_as_xy` in the unit of x and y of a projected system.
+    """What brings x, y, z [n, 3] (x east or longitude; `own_axes`: in the order of the system's own axes) to latitude,
+    longitude and height, and the name of their system, which `header` names; `where` that stands in the file. Where the
+    system has no heights, z is metres, or `heights_as_xy` in the unit of x and y of a projected system.
 
     Raises UnknownSystem, and CaptureError without pyproj.
     """
@@ -106,7 +108,7 @@ def to_geodetic(
     try:
         crs = pyproj.CRS.from_user_input(_named(header))
         flat = len(crs.axis_info) == 2
-        change = _to_latitude(crs, "EPSG:4326" if flat else "EPSG:4979")
+        change = _to_latitude(crs, "EPSG:4326" if flat else "EPSG:4979", own_axes)
         up = _unit_without_heights(crs) if heights_as_xy else 1.0
     except pyproj.exceptions.ProjError:
         raise UnknownSystem(
@@ -132,7 +134,7 @@ def to_geodetic(
 
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
-        name += "; heights as they are, for PROJ lacks the grid of their geoid"
+        name += WITHOUT_GEOID
     if heights := _UNKNOWN_HEIGHTS.match(header.strip(_AROUND)):
         name += f"; heights as they are, for {heights[1]!r} is not known"
     unknown = crs.datum is not None and not _says_its_shift(crs) and crs.datum.name.lower().startswith("unknown")
@@ -170,14 +172,25 @@ def height_unit(header: str | None) -> float:
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
-def _to_latitude(crs: Any, target: str) -> Callable[..., tuple[Any, ...]]:
+def has_heights(header: str) -> bool:
+    """Whether a system that `to_geodetic` knows has heights of its own."""
+    import pyproj
+
+    return len(pyproj.CRS.from_user_input(_named(header)).axis_info) > 2
+
+
+def _to_latitude(crs: Any, target: str, own_axes: bool = False) -> Callable[..., tuple[Any, ...]]:
     """What brings x, y and, of three axes, z of a system to latitude, longitude and height of `target`.
+
+    `own_axes`: x is the first of the system's axes, be that south; else east where the axes are north and east.
 
     `always_xy` of pyproj does not see that latitude is first where a system with heights holds one with TOWGS84, as
     Metashape writes it.
     """
     import pyproj
 
+    if own_axes:
+        return pyproj.Transformer.from_crs(crs, target).transform
     unseen = crs.is_compound and any(part.is_bound for part in crs.sub_crs_list)
     north_first = [axis.direction.lower() for axis in crs.axis_info[:2]] == ["north", "east"]
     if unseen and north_first:

@@ -68,8 +68,8 @@ _OTHERS = (
     ),
 )
 _DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
-#: Words of exiftool behind altitudes below the sea.
-_BELOW = re.compile(r"below|^1$", re.IGNORECASE)
+#: Words of exiftool behind altitudes below the sea, and EXIF's numbers (3 below, over the sea and not the ellipsoid).
+_BELOW = re.compile(r"below|negative|^[13]$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)")
 _WORD = re.compile(r"[^\W\d_]+")
 #: O behind an angle stands for east or for west.

@@ -95,7 +95,8 @@ def read(file: Path, options: CaptureOptions) -> Project:
     views = []
     order = np.argsort(model.seen_camera, kind="stable")
     starts = np.searchsorted(model.seen_camera[order], np.arange(model.num_cameras + 1))
-    for camera, name, size in zip(model.cameras, called, photograph_sizes(root, options, called, file), strict=True):
+    sizes = photograph_sizes(root, options, called, file) if called else []
+    for camera, name, size in zip(model.cameras, called, sizes, strict=True):
         mine = order[starts[camera.number] : starts[camera.number + 1]]
         shown = model.seen_point[mine], model.seen_px[mine] + np.array(size) / 2
         check_seen_inside(shown[1], size, file, name)

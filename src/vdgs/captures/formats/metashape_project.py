@@ -77,9 +77,18 @@ def read_chunks(file: Path) -> list[StoredChunk]:
         frame = chunk.find("frames/frame")
         path = zipped.parent / _inside((frame.get("path") if frame is not None else None) or "0/frame.zip", file)
         frame = read_xml(path) if path.is_file() else None
-        points = next(iter(sorted(path.parent.glob("point_cloud*/point_cloud.zip"))), None)
+        points = _tie_points(path.parent, frame, file)
         found.append(_stored(chunk, listed.get("id") == active, frame, points))
     return found
+
+
+def _tie_points(folder: Path, frame: Element | None, file: Path) -> Path | None:
+    """The archive of tie points that a frame in a folder names; else by its usual name. None where there is none."""
+    cloud = frame.find("point_cloud") if frame is not None else None
+    if cloud is not None and cloud.get("path"):
+        named = folder / _inside(cloud.get("path", ""), file)
+        return named if named.is_file() else None
+    return next(iter(sorted(folder.glob("point_cloud*/point_cloud.zip"))), None)
 
 
 def _folder(file: Path) -> Path:

@@ -326,9 +326,12 @@ def _report_system(
     poses = np.stack([view.camera_from_world for view in views])
     places = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     if (np.abs(geodetic[:, 0]) <= 90).all():
-        change, name = to_geodetic(utm_epsg(*np.median(geodetic, axis=0)[:2]), file)
-        off = np.abs(change(places)[:, :2] - geodetic[:, :2]).max()
-        if off < _SAME_PLACE_DEG:
-            return change, f"ODM, {name}"
+        # Mostly that of the middle; of the first photograph, or of a list of control points, beside a border of zones.
+        usual = int(utm_epsg(*np.median(geodetic, axis=0)[:2]).removeprefix("EPSG:"))
+        for half in (usual // 100, 326 + 327 - usual // 100):
+            for aside in (0, -1, 1):
+                change, name = to_geodetic(f"EPSG:{100 * half + (usual % 100 - 1 + aside) % 60 + 1}", file)
+                if np.abs(change(places)[:, :2] - geodetic[:, :2]).max() < _SAME_PLACE_DEG:
+                    return change, f"ODM, {name}"
     warnings.append(f"{file.name}: its positions are not those of a UTM zone; the scene has no place on Earth.")
     return None, ""

@@ -14,7 +14,15 @@ from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import (
+    WITHOUT_GEOID,
+    ToGeodetic,
+    UnknownSystem,
+    has_heights,
+    height_unit,
+    is_local_system,
+    to_geodetic,
+)
 from vdgs.captures.formats.brown_lens import MAX_POWERS, brown_intrinsics, quarter_turn_fisheye
 from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.gltf_points import GltfPoints, join_points, read_gltf_points
@@ -244,14 +252,17 @@ def _system(items: _Items) -> tuple[ToGeodetic | None, str, bool]:
     scale = parse_vector(change.get("scale", [1, 1, 1]), 3, file, "'scale'")
     if (scale <= 0).any():
         raise CaptureError(f"{file}: 'scale' must be positive. {_AGAIN}")
-    geoid = parse_number(crs, "geoid_height", file) or 0.0
-    known, name = to_geodetic(definition, file, "'definition'", heights_as_xy=True)
-    order = [1, 0, 2] if change.get("swap_xy") else [0, 1, 2]
+    geoid, swapped = parse_number(crs, "geoid_height", file), bool(change.get("swap_xy"))
+    # Where x and y change places the system is left-handed (north, east; south, west), and told with its own axes.
+    known, name = to_geodetic(definition, file, "'definition'", heights_as_xy=True, own_axes=swapped)
+    order = [1, 0, 2] if swapped else [0, 1, 2]
+    by_geoid = height_unit(definition) if geoid is not None and has_heights(definition) else None
 
     def to_earth(points: np.ndarray) -> np.ndarray:
         base = (points - shift)[:, order] / scale
-        # The system is told with its own axes; what is asked has x to the east. The geoid's height above the ellipsoid
-        # has the unit of the system's heights.
-        return known(base[:, order] + np.array([0.0, 0.0, geoid]))
+        # The geoid's height above the ellipsoid has the unit of the system's heights, and stands in the place of the
+        # model of the geoid that these are told by.
+        raised = base + np.array([0.0, 0.0, geoid or 0.0])
+        return known(raised) if by_geoid is None else np.column_stack([known(base)[:, :2], by_geoid * raised[:, 2]])
 
-    return to_earth, f"OPF, {name}", False
+    return to_earth, f"OPF, {name if by_geoid is None else name.replace(WITHOUT_GEOID, '')}", False

@@ -155,6 +155,7 @@ class _World:
     step: np.ndarray
     """Along each coordinate, for the slope of the change; about as long as the scene is wide."""
     georef: Georef | None
+    file: Path
 
     def moved(self, points: np.ndarray) -> np.ndarray:
         return points if self.to_geodetic is None or not len(points) else self.to_enu(self.to_geodetic(points))
@@ -167,7 +168,9 @@ class _World:
             return enu_from_geodetic(geodetic, self.georef.origin)
 
     def moved_poses(self, poses: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Each camera moves as its surroundings do: its rotation by the nearest to the slope of the change there."""
+        """Each camera moves as its surroundings do: its rotation by the nearest to the slope of the change there.
+
+        Raises `CaptureError` for a system that mirrors."""
         if self.to_geodetic is None:
             return list(poses)
         stack = np.stack(poses)
@@ -175,6 +178,11 @@ class _World:
         ends = [self.moved(centers + sign * step) for step in np.diag(self.step) for sign in (1, -1)]
         slopes = np.stack([(ends[k] - ends[k + 1]) for k in (0, 2, 4)], axis=2)
         left, _, right = np.linalg.svd(slopes / np.linalg.norm(slopes, axis=1, keepdims=True))
+        if (np.linalg.det(left @ right) < 0).any():
+            raise CaptureError(
+                f"{self.file}: the axes of its coordinate system are left-handed (south and west, or north and east), "
+                "in which cameras have no rotation. Export it in a system of east and north, such as a zone of UTM."
+            )
         turned, places = left @ right, self.moved(centers)
         result = np.tile(np.eye(4), (len(stack), 1, 1))
         result[:, :3, :3] = stack[:, :3, :3] @ np.swapaxes(turned, 1, 2)
@@ -185,7 +193,7 @@ class _World:
 def _world_of(project: Project) -> _World:
     if project.to_geodetic is None:
         local = Georef(None, "", project.place) if project.is_metric else None
-        return _World(None, np.ones(3), local)
+        return _World(None, np.ones(3), local, project.file)
     stack = np.stack([view.camera_from_world for view in project.views])
     centers = -np.einsum("nji,nj->ni", stack[:, :3, :3], stack[:, :3, 3])
     geodetic = project.to_geodetic(centers)
@@ -196,7 +204,9 @@ def _world_of(project: Project) -> _World:
         )
     latitude, longitude, altitude = median_place(geodetic)
     step = np.array([1e-4, 1e-4, 10.0]) if project.in_degrees else np.full(3, 10.0)
-    return _World(project.to_geodetic, step, Georef((latitude, longitude, round(altitude)), "", project.place))
+    return _World(
+        project.to_geodetic, step, Georef((latitude, longitude, round(altitude)), "", project.place), project.file
+    )
 
 
 # ---------------------------------------------------------------------------------------------------- points

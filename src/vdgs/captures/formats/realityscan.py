@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -20,7 +21,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, to_geodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, is_in_degrees, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, axis_rotation
 from vdgs.captures.formats.photograph_sizes import GIVE_ALIGNED, name_unaligned, photograph_sizes
@@ -30,6 +31,7 @@ from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.units import first_names
 
 #: Columns that say where a camera is; with them a table is one of registered cameras.
 _POSE = ("x", "y", "alt", "heading", "pitch", "roll")
@@ -53,6 +55,9 @@ _LONGEST_35MM = 1500.0
 _XMP_LOOKED_AT = 20
 #: Cameras of one flight are no farther apart in degrees, and have coordinates as large only in a projected system.
 _DEGREES_APART, _PROJECTED_FROM = 0.2, 20_000.0
+#: In degrees a flight is so many times farther from 0, 0 than it is wide, and so many times as high in metres; a world
+#: without scale lies about its own origin (choice).
+_FAR_IN_DEGREES, _HIGH_IN_METERS = 100.0, 50.0
 #: What RealityScan writes beside the points and models that it exports, and the system that it names there.
 _INFO, _SYSTEM = "*.[rR][cCsS][iI]nfo", re.compile(r'globalCoordinateSystemName="\s*epsg:(\d+)', re.IGNORECASE)
 #: Axes of cameras are so near the vertical, in degrees, only where a table in degrees has spoiled them.
@@ -70,6 +75,8 @@ class RegisteredCamera:
     lens: Mapping[str, float] = field(default_factory=dict)
     in_pixels: bool = False
     """Whether focal length and principal point are told in pixels, from the corner, of the photograph."""
+    component: str = ""
+    """Which part of the project it was aligned in, where the file says that."""
 
     def intrinsics(self, size: tuple[int, int], file: Path) -> Intrinsics:
         """The lens at the size of the photograph."""
@@ -112,7 +119,8 @@ def read(file: Path, options: CaptureOptions) -> Project:
             if isinstance(why, str) and why:
                 refused.setdefault(why, []).append(name)
         root = above.parent if above.name == "images" else above
-    warnings = name_unaligned(unaligned)
+    cameras, warnings = _of_one_world(cameras)
+    warnings += name_unaligned(unaligned)
     if file.suffix.lower() != ".xmp" and _may_be_division(cameras):
         warnings.append(
             f"{file.name}: of the lens only k1 is set, and is taken for Brown's. If the lens model was Division, align "
@@ -134,6 +142,19 @@ def read(file: Path, options: CaptureOptions) -> Project:
     )  # fmt: skip
 
 
+def _of_one_world(cameras: list[RegisteredCamera]) -> tuple[list[RegisteredCamera], list[str]]:
+    """Cameras that share a world, and what to say of the others: those of the component of most cameras, for each
+    component has coordinates of its own; all of them in a projected system."""
+    components = Counter(camera.component for camera in cameras)
+    centers = np.array([-each.camera_from_world[:3, :3].T @ each.camera_from_world[:3, 3] for each in cameras])
+    if len(components) < 2 or np.abs(np.median(centers[:, :2], axis=0)).max() > _PROJECTED_FROM:
+        return cameras, []
+    largest = components.most_common(1)[0][0]
+    lost = [camera.name for camera in cameras if camera.component != largest]
+    said = f"{len(lost)} cameras of other components have no place in the same world and are left out"
+    return [camera for camera in cameras if camera.component == largest], [f"{said} ({first_names(lost)})."]
+
+
 def _may_be_division(cameras: list[RegisteredCamera]) -> bool:
     """Whether the table may be of the Division model, which it does not say: k1 alone."""
     set_terms = {key for camera in cameras for key, value in camera.lens.items() if value and key[0] in "kt"}
@@ -149,12 +170,13 @@ def _world(views: tuple[ProjectView, ...], file: Path) -> tuple[ToGeodetic | Non
     poses = np.stack([view.camera_from_world for view in views])
     centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     middle, spread = np.abs(np.median(centers, axis=0)), np.ptp(centers, axis=0)
+    wide = spread[:2].max()
     if (
-        (spread[:2] < _DEGREES_APART).all()
-        and spread[:2].any()
+        0 < wide < _DEGREES_APART
         and middle[0] <= 180
         and middle[1] <= 90
-        and middle[2] > 1e3 * spread[:2].max()
+        and middle[:2].max() > _FAR_IN_DEGREES * wide
+        and max(middle[2], spread[2]) > _HIGH_IN_METERS * wide
     ):
         spoiled = np.degrees(np.arccos(np.abs(poses[:, 0, 2]).clip(0, 1))) < _SPOILED_DEG
         if spoiled.mean() > 0.5:
@@ -172,7 +194,8 @@ def _world(views: tuple[ProjectView, ...], file: Path) -> tuple[ToGeodetic | Non
 
 
 def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
-    """The projected system that the information beside a point cloud or a model in the folder names."""
+    """The projected system that the information beside a point cloud or a model in the folder names; none where it
+    names degrees, which the coordinates are not."""
     for info in sorted(file.parent.glob(_INFO)):
         try:
             found = _SYSTEM.search(decode_text(info.read_bytes()))
@@ -181,7 +204,7 @@ def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
                 f"{info}: names the coordinate system of the export, and cannot be read ({error.strerror or error}). "
                 "Copy it again."
             ) from error
-        if found is not None:
+        if found is not None and not is_in_degrees(f"EPSG:{found[1]}"):
             return to_geodetic(f"EPSG:{found[1]}", info, "globalCoordinateSystemName")
     return None
 
@@ -292,8 +315,6 @@ def read_xmp(file: Path) -> RegisteredCamera | str:
     model = found.get("DistortionModel", "").lower()
     if "Rotation" not in found or "Position" not in found:
         return ""
-    if found.get("Coordinates", "absolute").lower() == "relative":
-        return "the pose is relative to a rig: export absolute poses"
     projection = found.get("ProjectionModel", "perspective").lower()
     if projection not in ("", "perspective"):
         return f"the projection {projection!r} is not supported"
@@ -321,8 +342,9 @@ def read_xmp(file: Path) -> RegisteredCamera | str:
     lens |= {"aspect": number("AspectRatio", 1.0), "skew": number("Skew", 0.0)}
     pose = to_rigid(pose, file, "xcr:Rotation")
     return RegisteredCamera(
-        name=file.stem, camera_from_world=pose, focal_35mm=number("FocalLength35mm", 0.0), lens=lens
-    )
+        name=file.stem, camera_from_world=pose, focal_35mm=number("FocalLength35mm", 0.0), lens=lens,
+        component=found.get("ComponentId", ""),
+    )  # fmt: skip
 
 
 def _properties(element: Element) -> list[tuple[str, str]]:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.project import ProjectView
-from vdgs.captures.formats.project_photographs import image_root
 from vdgs.captures.formats.xml_documents import read_xml, root_element, xml_numbers
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -25,8 +24,8 @@ def original_names(file: Path, options: CaptureOptions) -> dict[str, str]:
     """Paths on the card by what Terra calls the photographs, in lower case; none where there is no list beside the
     file, above it or in the folder of photographs."""
     folders = [file.parent, file.parent.parent]
-    if options.images is not None:
-        folders.insert(0, image_root(file.parent, options))
+    if options.images is not None:  # beside the file or, of a whole project, above it, or from here
+        folders = [*(folder / options.images for folder in folders), Path(options.images), *folders]
     lists = [folder / name for folder in folders for name in _LISTS]
     found = next((each for each in lists if each.is_file()), None)
     if found is None:
