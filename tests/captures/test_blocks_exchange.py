@@ -305,8 +305,9 @@ def test_terra_by_its_own_names_and_by_those_of_the_card(tmp_path):
     assert_true(source, flight)
     assert any("lens distortion Terra has undone" in each for each in source.warnings)
     theirs.touch(mine / "images")
-    source = read_files(mine, OPTIONS)
-    assert_true(source, theirs)
+    for options in (OPTIONS, CaptureOptions(images="images")):  # beside the file's folder, in the project
+        source = read_files(mine, options)
+        assert_true(source, theirs)
     assert len(source.points) == len(flight.points)
 
 

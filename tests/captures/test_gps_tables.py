@@ -503,3 +503,17 @@ def test_a_row_of_units_below_the_headings_counts(tmp_path, units):
 @pytest.mark.parametrize("number", ["350\u00a0000,12", "350\u202f000,12", "350 000,12", "350'000.12", "350.000,12"])
 def test_signs_between_thousands_are_those_of_any_country(number):
     assert number_of(number) == 350000.12
+
+
+@pytest.mark.parametrize("said", ["1", "3", "Below Sea Level", "Negative Sea Level (sea-level ref)"])
+def test_altitudes_below_the_sea_are_negative_as_exiftool_says_it(tmp_path, said):
+    file = tmp_path / "dead sea.csv"
+    rows = "".join(f"{k}.jpg,31.5,35.5,{400 + k},{said}\n" for k in range(3))
+    file.write_text("SourceFile,GPSLatitude,GPSLongitude,GPSAltitude,GPSAltitudeRef\n" + rows)
+    assert [row.position[2] for row in read_gps_table(file).rows] == [-400, -401, -402]
+
+
+def test_headings_of_any_letters_are_read_in_no_time():
+    """Ways to part letters into words grow with every letter, and are not all tried."""
+    assert meanings_of("m" * 3000 + "q") is None
+    assert meanings_of("m" * 3000) is not None

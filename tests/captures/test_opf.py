@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyproj
 import pytest
 
 from support import project_writers as writers
@@ -17,6 +19,7 @@ from support.known_flight import (
 )
 from support.project_reading import check_numbers, known_points, read
 from vdgs.captures.format_dispatch import read_source
+from vdgs.captures.formats import opf
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -54,6 +57,35 @@ def test_the_geoid_of_opf_has_the_unit_of_its_heights(tmp_path: Path, flight: Kn
         assert georef.origin is not None
         heights.append(georef.origin[2])
     assert heights[1] - heights[0] == pytest.approx(-100 * unit, abs=1.0)  # origins are whole metres
+
+
+def test_heights_by_a_geoid_of_opf_are_converted_once(tmp_path: Path, flight: KnownFlight) -> None:
+    """The stated height of the geoid stands in the place of a model of it, whether PROJ has its grid or not."""
+    writers.write_opf(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    frame = tmp_path / "scene-reference-frame.json"
+    content = json.loads(frame.read_text())
+    alone = read(tmp_path, "opf").georef
+    content["crs"] = {"definition": f"{content['crs']['definition']}+5773", "geoid_height": 40.0}
+    frame.write_text(json.dumps(content))
+    georef = read(tmp_path, "opf").georef
+    assert georef is not None
+    assert georef.origin[2] - alone.origin[2] == pytest.approx(40, abs=1)
+    assert "heights as they are" not in georef.method
+
+
+def test_opf_tells_left_handed_systems_by_their_own_axes(tmp_path: Path) -> None:
+    """Krovak's are south and west; a processing frame is right-handed, with x and y exchanged."""
+    wkt = pyproj.CRS(5513).to_wkt()
+    base = np.array([1044002.0, 744005.0, 400.0])
+    change = {"shift": (-base[[1, 0, 2]]).tolist(), "scale": [1, 1, 1], "swap_xy": True}
+    (tmp_path / "frame.json").write_text(json.dumps({"crs": {"definition": wkt}, "base_to_canonical": change}))
+    items = SimpleNamespace(path=lambda what: tmp_path / "frame.json")
+    to_earth = opf._system(items)[0]
+    place, west, south = to_earth(np.array([[0.0, 0, 0], [100, 0, 0], [0, 100, 0]]))
+    assert place[:2] == pytest.approx([50.0772, 14.4066], abs=1e-3)  # Prague
+    assert west[1] < place[1]
+    assert south[0] < place[0]
 
 
 def test_fisheyes_of_opf_are_their_formula(tmp_path: Path, flight: KnownFlight) -> None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 from PIL import Image
 
@@ -22,8 +23,9 @@ from support.known_flight import (
     known_flight,
 )
 from support.project_reading import OPTIONS, check_numbers, check_tie_points, known_points, read
+from vdgs.captures.capture_root import capture_root
 from vdgs.captures.format_dispatch import lacks_points, read_source
-from vdgs.captures.formats import las_reader
+from vdgs.captures.formats import las_reader, opensfm
 from vdgs.captures.loading import load_capture
 from vdgs.captures.project_formats import PROJECTS, read_project
 from vdgs.config.capture_options import CaptureOptions
@@ -118,6 +120,41 @@ def test_report_of_odm_is_read_where_its_reconstruction_is_gone(tmp_path: Path, 
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     with pytest.raises(CaptureError, match="none of its 12 photographs"):
         lacks_points(tmp_path / "odm_report" / "shots.geojson", OPTIONS)
+
+
+@pytest.mark.parametrize("zone", [31, 32, 33])
+def test_report_of_odm_may_be_in_the_zone_beside_that_of_its_photographs(tmp_path: Path, zone: int) -> None:
+    """Of the first photograph, or of the first control point, where a flight crosses a border of zones."""
+    lens = {"projection_type": "brown", "width": 400, "height": 300, "focal_x": 0.8, "focal_y": 0.8, "c_x": 0, "c_y": 0}
+    (tmp_path / "cameras.json").write_text(json.dumps({"c": lens | dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0)}))
+    change = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{32600 + zone}", always_xy=True)
+    shots = []
+    for k in range(5):
+        place = [(12.0 if zone > 31 else 6.0) + 1e-4 * (k - 1 if zone == 32 else 1 - k), 51.0]
+        shot = {"filename": f"{k}.jpg", "camera": "c", "width": 400, "height": 300, "rotation": [3.14159, 0, 0],
+                "translation": [*change.transform(*place), 300]}  # fmt: skip
+        shots.append({"properties": shot, "geometry": {"coordinates": [*place, 300]}})
+    (tmp_path / "odm_report").mkdir()
+    file = tmp_path / "odm_report" / "shots.geojson"
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": shots}))
+    project = opensfm.read(file, OPTIONS)
+    assert project.place.endswith(f"zone {zone}N")
+    assert not project.warnings
+
+
+def test_bundler_in_its_own_layout_is_read_by_folder_and_by_file(tmp_path: Path, flight: KnownFlight) -> None:
+    """The list and the photographs in the root, the model in bundle/."""
+    file = writers.write_bundler(tmp_path / "bundle", flight)
+    flight.write_photographs(tmp_path)
+    (tmp_path / "list.txt").write_text("\n".join(flight.names))
+    (tmp_path / "bundle" / "list.txt").unlink()
+    assert capture_root(file) == tmp_path
+    assert len(read_source(file, OPTIONS).views) == len(read_source(tmp_path, OPTIONS).views) == len(flight.names)
+    header, counts, *_ = file.read_text().splitlines()
+    nothing = ["0 0 0"] * 5 * int(counts.split()[0])
+    file.write_text("\n".join([header, f"{counts.split()[0]} 0", *nothing]))
+    with pytest.raises(CaptureError, match="no camera of it has a pose"):
+        read_source(file, OPTIONS)
 
 
 def _check_names_of_cameras(project: Path, flight: KnownFlight) -> None:

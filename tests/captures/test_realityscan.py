@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from support import project_writers as writers
 from support.known_flight import (
@@ -17,6 +18,8 @@ from support.known_flight import (
     known_flight,
 )
 from support.project_reading import check_numbers, read
+from vdgs.captures.formats import realityscan
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
 
@@ -67,6 +70,45 @@ def test_information_beside_a_cloud_of_realityscan_places_its_table(tmp_path: Pa
     (tmp_path / "cloud.ply.rsInfo").symlink_to(tmp_path / "gone")  # a place must not get lost in silence
     with pytest.raises(CaptureError, match=r"cloud\.ply\.rsInfo: .* cannot be read"):
         read(tmp_path, "realityscan")
+
+
+def test_information_in_degrees_does_not_place_coordinates_in_metres(tmp_path: Path, flight: KnownFlight) -> None:
+    _, poses, _, centers = writers.utm_flight(flight)
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", flight, centers, poses)
+    flight.write_photographs(tmp_path / "images")
+    (tmp_path / "cloud.rsInfo").write_text('<Model globalCoordinateSystemName="epsg:4326 - GPS (WGS 84)"/>')
+    assert read(tmp_path, "realityscan").georef.origin is None  # type: ignore[union-attr]
+
+
+def test_cameras_of_several_components_share_no_world(tmp_path: Path, flight: KnownFlight) -> None:
+    """Those of the component of most cameras are read, be their poses relative to it, as it is written."""
+    flight.write_photographs(tmp_path / "images")
+    writers.write_realityscan_xmp(tmp_path / "images", flight)
+    for number, file in enumerate(sorted((tmp_path / "images").glob("*.xmp"))):
+        component = "{B}" if number < 3 else "{A}"
+        text = file.read_text().replace('"absolute"', f'"relative" xcr:ComponentId="{component}"')
+        file.write_text(text)
+    source = read(tmp_path, "realityscan")
+    assert [view.name for view in source.views] == list(flight.names[3:])
+    assert any("3 cameras of other components" in note for note in source.warnings)
+
+
+@pytest.mark.parametrize("height", [8.0, 45.0, 300.0])
+@pytest.mark.parametrize("wide", [0.01, 0.06])
+def test_low_and_wide_flights_in_degrees_are_told_from_worlds_without_scale(tmp_path, height, wide):
+    rng = np.random.default_rng(0)
+    rows = [(4.5 + wide * rng.random(), 52 + wide * rng.random(), height + rng.normal()) for _ in range(12)]
+    head = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    lens = "0,0.5,0,24,0,0,0,0,0,0,0,0"
+    for k in range(12):
+        Image.new("RGB", (40, 30)).save(tmp_path / f"{k}.jpg")
+    table = tmp_path / "cameras.csv"
+    table.write_text(head + "".join(f"{k}.jpg,{x},{y},{z},{lens}\n" for k, (x, y, z) in enumerate(rows)))
+    assert realityscan.read(table, CaptureOptions()).in_degrees
+    table.write_text(
+        head + "".join(f"{k}.jpg,{x - 4.5},{y - 52},{z / 1e3},{lens}\n" for k, (x, y, z) in enumerate(rows))
+    )
+    assert not realityscan.read(table, CaptureOptions()).in_degrees
 
 
 def test_angles_that_degrees_have_spoiled_are_refused(tmp_path: Path, flight: KnownFlight) -> None:

@@ -204,8 +204,10 @@ def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
                 f"{info}: names the coordinate system of the export, and cannot be read ({error.strerror or error}). "
                 "Copy it again."
             ) from error
-        if found is not None and not is_in_degrees(f"EPSG:{found[1]}"):
-            return to_geodetic(f"EPSG:{found[1]}", info, "globalCoordinateSystemName")
+        if found is not None:
+            known = to_geodetic(f"EPSG:{found[1]}", info, "globalCoordinateSystemName")
+            if not is_in_degrees(f"EPSG:{found[1]}"):
+                return known
     return None
 
 
