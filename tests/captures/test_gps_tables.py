@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from support.flights import small_photographs
+from vdgs.captures.column_headings import meanings_of
 from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_tables import read_gps_table
 from vdgs.captures.table_columns import number_of

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from xml.etree.ElementTree import Element, tostring
 
 import numpy as np
 import pytest
@@ -36,6 +38,7 @@ from support.true_flight import (
 )
 from vdgs.captures.formats.lens_projection import pixel_rays, ray_pixels
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture
+from vdgs.captures.formats.xml_documents import read_xml
 from vdgs.captures.loading import read_files
 from vdgs.captures.project_formats import read_project
 from vdgs.config.capture_options import CaptureOptions
@@ -275,6 +278,22 @@ def test_a_project_is_read_with_its_tie_points(tmp_path, suffix):
             assert np.abs(seen[:, :2] / seen[:, 2:] - view.observations.rays).max() * flight.lens.f < 0.02
     (tmp_path / "cameras.xml").write_text(metashape_xml(flight))
     assert not len(read_project(tmp_path, "metashape", OPTIONS, needs_points=False).points)
+
+
+def test_the_tie_points_of_a_project_are_those_that_its_frame_names(tmp_path):
+    """An older archive beside them has another number."""
+    flight = true_flight(count=4)
+    flight.touch(tmp_path)
+    file = write_project(tmp_path, flight)
+    folder = tmp_path / "project.files" / "0" / "0"
+    (folder / "point_cloud").rename(folder / "point_cloud.2")
+    (folder / "point_cloud.1").mkdir()
+    (folder / "point_cloud.1" / "point_cloud.zip").write_bytes(b"an older one")
+    frame = read_xml(folder / "frame.zip")
+    frame.append(Element("point_cloud", path="point_cloud.2/point_cloud.zip"))
+    with zipfile.ZipFile(folder / "frame.zip", "w") as zipped:
+        zipped.writestr("doc.xml", tostring(frame))
+    assert len(read_files(file, OPTIONS).points) == len(flight.points)
 
 
 def test_a_project_that_is_not_whole_says_what_to_copy(tmp_path):
