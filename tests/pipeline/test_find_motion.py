@@ -13,6 +13,7 @@ from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
 from support.small_pipeline import BLOCK, CUT, SETTINGS, train_coarse, vdgs
+from vdgs.captures.capture_metadata import capture_fingerprint
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -21,6 +22,7 @@ from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import BlockConfig, MethodConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.evaluation.moving_pixels import MIN_MOVING_SHARE, SAMPLED_PHOTOGRAPHS
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.ops.api import train
 from vdgs.pipeline import find_motion
 from vdgs.pipeline.run_estimate import Scene, _other_times
@@ -94,6 +96,8 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys, monkeypatch):
 
     vdgs("partition", run, "--blocks", "1")
     vdgs("train-blocks", run, "--block", "0", *BLOCK)
+    trained = AnchorModel.load(context.run.block(0).model).metadata.capture
+    assert trained["fingerprint"] == capture_fingerprint(context.capture)  # of its own masks, not of these
     vdgs("report", run)
     assert "What moves" in (run / "report.html").read_text()
     config.write_text(config.read_text().replace("mask_moving: 'on'", "mask_moving: auto"))
