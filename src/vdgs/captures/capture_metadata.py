@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +40,17 @@ def capture_fingerprint(capture: Capture) -> dict[str, int]:
     to read thousands of them whenever a run is opened takes too long. Without masks there is no part of theirs."""
     parts = {
         "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
-        "photographs": _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in capture.views)),
+        "photographs": photographs_crc(capture.views),
         "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
         "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
     masks = _masks(capture)
     return parts | ({MASKS: _crc(*(f"{name}:{mask.stat().st_size}" for name, mask in masks.items()))} if masks else {})
+
+
+def photographs_crc(views: Sequence[View]) -> int:
+    """CRC-32 of photographs by their names and sizes in bytes."""
+    return _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in views))
 
 
 def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
