@@ -235,3 +235,16 @@ def test_a_folder_that_an_option_names_is_looked_at_with_all_below(tmp_path):
         capture=place, output=tmp_path / "run", options=CaptureOptions(masks=str(tmp_path / "masks"))
     )  # fmt: skip
     assert max(_input_times(request, ())) == mask.stat().st_mtime_ns
+
+
+def test_settings_that_the_coarse_stage_leaves_as_they_are_are_named(native_small: NativeRun, tmp_path, capsys):
+    run, file = shutil.copytree(native_small.whole, tmp_path / "run"), tmp_path / "five.yaml"
+    file.write_text("partition: {blocks: 5}\nblock: {iterations: 77}\n")
+    before = (run / "config.yaml").read_text()
+    again = ("train-coarse", native_small.capture, "--output", run)
+    vdgs(*again, "--config", file)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "keeps its settings of later stages (--block.iterations: 10 -> 77, --blocks: 2 -> 5): `vdgs run`" in said
+    vdgs(*again)
+    assert "later stages" not in capsys.readouterr().out
+    assert (run / "config.yaml").read_text() == before
