@@ -214,5 +214,5 @@ def test_the_doctor_sees_the_same_limit(large, monkeypatch):
     monkeypatch.setenv("SLURM_MEM_PER_NODE", str(64 << 10))
     free, _, why = memory_with([CgroupLimit(NONE, GB)]).partition(" GB free, ")
     assert 40 < float(free) < 68.7
-    assert why == "limited to 68.7 GB by what the SLURM job asked for (--mem, --mem-per-cpu)"
+    assert why == "limited to 68.7 GB by what the SLURM job asked for"
     assert memory_with(limited).endswith("(container, SLURM job, systemd unit)")

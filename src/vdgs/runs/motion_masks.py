@@ -43,7 +43,7 @@ def with_motion_masks(run: RunFolder, capture: Capture, *, needed: bool = True) 
             return capture
         raise RunError(
             f"{run.motion_file}: the blocks need the masks of what moves, which was not looked for with this coarse "
-            f"model. Look for it: vdgs visibility {shell_word(run.path)} (or train without: --block.mask-moving off)"
+            f"model. Look for it: vdgs visibility {shell_word(run.path)}; or train without: --block.mask-moving off"
         )
     masks = {
         each["photograph"]: run.motion_file.with_name(each["mask"])

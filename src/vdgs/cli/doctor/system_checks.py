@@ -129,7 +129,7 @@ def _memory() -> list[SystemCheck]:
     total, free = min([memory.total, *(group.limit for group in groups)]), available_memory_bytes()
     by = "by a control group (container, SLURM job, systemd unit)"
     if total == memory.total and job is not None:  # as `available_memory_bytes` counts it
-        total, by = min(total, job), "by what the SLURM job asked for (--mem, --mem-per-cpu)"
+        total, by = min(total, job), "by what the SLURM job asked for"
     if total < memory.total:
         return [SystemCheck("memory", "ok", f"{data_size(free)} free, limited to {data_size(total)} {by}")]
     return [SystemCheck("memory", "ok", f"{data_size(free)} free of {data_size(total)}")]
