@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,9 @@ from vdgs.captures.capture import Capture, View
 from vdgs.errors import RunError
 from vdgs.system.documents import CaptureMetadata
 
+#: The part of a fingerprint that captures with masks have.
+MASKS = "masks"
+
 
 def capture_metadata(capture: Capture) -> CaptureMetadata:
     """What capture.json and a model say about where they come from."""
@@ -21,7 +24,7 @@ def capture_metadata(capture: Capture) -> CaptureMetadata:
         "root": str(capture.root), "source": capture.source, "images": capture.images,
         "training_views": [view.name for view in capture.train_views],
         "test_views": [view.name for view in capture.test_views],
-        "points": len(capture.points),
+        "masked_views": len(_masks(capture)), "points": len(capture.points),
         "ground_frame": {
             "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
             "metric": ground.metric, "how": ground.description, "origin_geo": ground.origin_geo,
@@ -33,13 +36,21 @@ def capture_metadata(capture: Capture) -> CaptureMetadata:
 
 
 def capture_fingerprint(capture: Capture) -> dict[str, int]:
-    """CRC-32 of each part of a capture that results depend on. Photographs count by name and size in bytes."""
-    return {
+    """CRC-32 of each part of a capture that results depend on. Photographs and masks count by name and size in bytes:
+    to read thousands of them whenever a run is opened takes too long. Without masks there is no part of theirs."""
+    parts = {
         "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
-        "photographs": _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in capture.views)),
+        "photographs": photographs_crc(capture.views),
         "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
         "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
+    masks = _masks(capture)
+    return parts | ({MASKS: _crc(*(f"{name}:{mask.stat().st_size}" for name, mask in masks.items()))} if masks else {})
+
+
+def photographs_crc(views: Sequence[View]) -> int:
+    """CRC-32 of photographs by their names and sizes in bytes."""
+    return _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in views))
 
 
 def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
@@ -50,13 +61,21 @@ def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any]
             f"{source}: does not say which capture the run belongs to. It is damaged; begin another run: "
             "vdgs run CAPTURE --output RUN"
         )
-    changed = [part for part, crc in capture_fingerprint(capture).items() if known.get(part) != crc]
+    now = capture_fingerprint(capture)
+    if "masked_views" not in (before or {}):  # written when masks did not count: nobody knows what they were
+        now.pop(MASKS, None)
+    changed = [part for part in {**now, **known} if known.get(part) != now.get(part)]
     if changed:
         raise RunError(
             f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "
             "Restore the capture as it was (or the former version of vdgs, where that read the same files otherwise), "
             "or begin another run: vdgs run CAPTURE --output RUN"
         )
+
+
+def _masks(capture: Capture) -> dict[str, Path]:
+    """The masks of photographs, by the names of these."""
+    return {view.name: view.mask_path for view in capture.views if view.mask_path is not None}
 
 
 def _camera_bytes(view: View) -> bytes:

@@ -28,6 +28,8 @@ class CaptureMetadata(TypedDict, total=False):
     images: str
     training_views: list[str]
     test_views: list[str]
+    #: Photographs with a mask; older files do not say it, nor have a part for masks in the fingerprint.
+    masked_views: int
     points: int
     ground_frame: GroundFrameDocument
     warnings: list[str]
@@ -84,6 +86,8 @@ class MeasuredAs(TypedDict, total=False):
     lpips_weights: str
     bins: int
     exposed: str | None
+    #: CRC-32 of the photographs, of those from where nobody flew.
+    photographs: int
 
 
 class StageStatusDocument(TypedDict):
