@@ -1,0 +1,42 @@
+"""Work that was stopped goes on with what it has, but for what the command that goes on makes another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from support.flights import ORIGIN, write_photograph
+from vdgs.captures.reconstruction import read_digests
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.reconstruction_plan import plan_reconstruction
+from vdgs.sfm.step_keys import step_keys
+
+
+def strips(card: Path, table: Path) -> Path:
+    """Twelve photographs that say nothing of how they were flown, and a table that says: in level strips."""
+    card.mkdir()
+    lines = ["name,lat,lon,alt"]
+    for k in range(12):
+        pixels = np.random.default_rng(k).integers(0, 255, (120, 160, 3), np.uint8)
+        write_photograph(card / f"{k:02d}.jpg", pixels, k, None)
+        place = np.array([[30.0 * (k % 4), 30.0 * (k // 4), 60.0]])
+        lines.append(f"{k:02d}.jpg,{','.join(f'{value:.8f}' for value in geodetic_from_enu(place, ORIGIN)[0])}")
+    table.write_text("\n".join(lines))
+    return card
+
+
+def test_models_are_made_anew_where_positions_that_come_later_hold_the_focal_length(tmp_path):
+    """A model whose focal length was fitted is none of one that was held. What was matched stays, and a finished
+    capture is placed anew."""
+    card = strips(tmp_path / "card", tmp_path / "gps.csv")
+    held, keys = [], []
+    for gps in (None, tmp_path / "gps.csv"):
+        request = SfmRequest(image_folders=(card,), output=tmp_path / "capture", gps=gps)
+        plan = plan_reconstruction(request)
+        held.append(should_fix_focal(plan.image_list.images, plan.gps_priors, SfmOptions())[0])
+        keys.append(step_keys(plan, read_digests(request.output)))
+    assert held == [False, True]
+    assert {step for step in keys[0] if keys[0][step] == keys[1][step]} == {"features", "matches", "capture"}
