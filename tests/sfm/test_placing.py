@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,10 @@ from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, workspace
 from vdgs.sfm.reconstruct import reconstruct
+from vdgs.system.atomic_files import write_json
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]
 
@@ -127,6 +130,21 @@ def test_mirrored_tables_are_refused_and_leave_the_capture_as_it_was(nine, captu
             again(nine, capture, file)
     assert files(capture) == before
     assert "used all the same" in again(nine, capture, mirrored, georeference="anyway")[1]
+
+
+def test_what_was_trained_is_deleted_only_once_the_new_place_is_not_refused(nine, capture, tmp_path):
+    run = RunFolder(tmp_path / "run")
+    write_json(run.capture_file, {})  # as training leaves it
+    mirrored = table(tmp_path / "north.csv", nine, lambda enu: enu * [1, -1, 1])
+    request = SfmRequest(image_folders=(nine.folder,), output=capture, gps=mirrored, threads=1, overwrite=True)
+    before = files(capture)
+    with pytest.raises(CaptureError, match="mirrored"):
+        reconstruct(request, console(), run, "vdgs run --gps north.csv")
+    assert run.is_trained
+    assert files(capture) == before
+    right = table(tmp_path / "gps.csv", nine, lambda enu: enu + 1)
+    reconstruct(replace(request, gps=right), console(), run, "vdgs run --gps gps.csv")
+    assert not run.is_trained
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ from vdgs.sfm import (
 from vdgs.sfm.camera_rigs import map_rigs
 from vdgs.sfm.console_report import print_reconstruction_report
 from vdgs.sfm.films.take_frames import with_frames
-from vdgs.sfm.georeferencing import georeference
+from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.panoramas import apply_rigs
 from vdgs.sfm.position_plots import plot_positions, plot_residuals
@@ -106,10 +106,12 @@ def reconstruct(
     check_nothing_trained(request, run)
     before = _placed_before(output, keys["capture"])
     if before is not None:
+        began = time.monotonic()
+        found = _placed_again(prepared, before)  # may be refused: before anything is deleted or noted
         with writing(request, run):
             sources.write(output)
             digests.write()
-            facts = _place_anew(prepared, before, keys, console)
+            facts = _place_anew(prepared, before, found, keys, began, console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
         print_reconstruction_report(facts, console)
         return facts
@@ -173,15 +175,28 @@ def _placed_before(output: Path, key: str) -> ReconstructionReport | None:
     return read_reconstruction(output)
 
 
+def _placed_again(prepared: ReconstructionPlan, before: ReconstructionReport) -> Georeferenced:
+    """The model of a finished capture where it belongs now. Nothing is written; raises CaptureError for positions,
+    distances and control points that are refused, and for a lens that these fit to none that there is."""
+    model = pycolmap.Reconstruction(prepared.request.output / MAPPED)
+    found = georeference(model, prepared, before.focal_fixed)
+    _lenses(found.model)
+    return found
+
+
 def _place_anew(
-    prepared: ReconstructionPlan, before: ReconstructionReport, keys: dict[str, str], console: Console
+    prepared: ReconstructionPlan,
+    before: ReconstructionReport,
+    found: Georeferenced,
+    keys: dict[str, str],
+    began: float,
+    console: Console,
 ) -> ReconstructionReport:
-    """Place the model of a finished capture again; it stays as it is where that is refused. Photographs are written
-    again only where what places it tells another lens, and where that was interrupted."""
-    began, collection = time.monotonic(), prepared.image_list
+    """Write where a finished capture lies now. Photographs are written again only where what places it tells another
+    lens, and where that was interrupted. `began`: when placing did, by the monotonic clock."""
+    collection = prepared.image_list
     output, photographs = prepared.request.output, collection.images
     kinds, finished = feature_extraction.group_by_camera(photographs), Workspace(output)
-    found = georeference(pycolmap.Reconstruction(output / MAPPED), prepared, before.focal_fixed)
     if not finished.is_done("capture", keys["capture"]) or _lens_moved(output, found.model):
         work = Workspace(output / WORK_FOLDER)
         feature_extraction.write_upright_images(work, photographs)
