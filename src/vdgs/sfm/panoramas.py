@@ -73,13 +73,18 @@ def _upright(path: Path, orientation: int) -> np.ndarray:
 
 def apply_rigs(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> None:
     """Let the views of each panorama move as one in COLMAP's database, once it has all of them."""
-    folders = sorted({view.name.split("/")[0].rpartition("_")[0] for view in photographs if view.face})
-    configs = [pycolmap.RigConfig(cameras=[_rig_camera(folder, face) for face in FACES]) for folder in folders]
+    configs = rig_configs(photographs)
     if not configs:
         return
     with workspace.open_database() as database:
         if not any(rig.num_sensors() > 1 for rig in database.read_all_rigs()):
             pycolmap.apply_rig_config(configs, database)
+
+
+def rig_configs(photographs: Sequence[ImageMetadata]) -> list[pycolmap.RigConfig]:
+    """The rigs of views: one for each size of panoramas."""
+    folders = sorted({view.name.split("/")[0].rpartition("_")[0] for view in photographs if view.face})
+    return [pycolmap.RigConfig(cameras=[_rig_camera(folder, face) for face in FACES]) for folder in folders]
 
 
 def _rig_camera(folder: str, face: str) -> pycolmap.RigConfigCamera:

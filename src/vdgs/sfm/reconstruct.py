@@ -37,7 +37,7 @@ from vdgs.sfm import (
     incremental_mapper,
     mask_files,
 )
-from vdgs.sfm.camera_rigs import map_rigs
+from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
 from vdgs.sfm.console_report import print_reconstruction_report
 from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import Georeferenced, georeference
@@ -355,6 +355,7 @@ def _models(
         if not workspace.is_begun("model", key):
             workspace.forget("model", "joined", "rigs", "focal")  # before: what is done is read
             incremental_mapper.delete_models(workspace)
+            take_rigs_apart(workspace, plan.image_list.images)
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
         workspace.finish("model", key)
