@@ -308,18 +308,19 @@ def _features(
 
 
 def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: Console) -> int:
+    """Match what may show the same; the number of pairs."""
+    if workspace.is_done("matches", key):  # to choose them again may last: by looks it takes all descriptors
+        return feature_matching.count_pairs(workspace)
     photographs = plan.image_list.images
     chosen = feature_matching.select_pairs(workspace, photographs, plan.gps_priors, plan.request.options)
     there = feature_extraction.count_features(workspace)
     chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]
-    if workspace.is_done("matches", key):
-        return len(chosen)
     if not workspace.is_begun("matches", key):
         feature_matching.delete_matches(workspace)
         workspace.begin("matches", key)
     feature_matching.match_pairs(workspace, chosen, plan.threads, console)
     workspace.finish("matches", key)
-    return len(chosen)
+    return feature_matching.count_pairs(workspace)
 
 
 def _mapped(
