@@ -254,7 +254,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     write_mask(output / "masks/old.png", left_half())  # of other masks
     reconstruct._write(prepared, work, model, model, "key", console())
     writer, lenses = reconstruct.capture_writer, reconstruct._lenses(model)
-    pinholes = {number: writer.make_undistortion(lens, 200).intrinsics for number, lens in lenses.items()}
+    pinholes = {number: writer.straight_camera(lens, 200) for number, lens in lenses.items()}
     writer.write_model(output, model, pinholes)
     capture = load_capture(output)
     names = {view.name: view.mask_path and view.mask_path.name for view in capture.views}

@@ -274,9 +274,7 @@ def _finish(prepared: ReconstructionPlan, outcome: ReconstructionResult, key: st
     if outcome.metric is not None:
         write_json(output / "georef.json", _georef(facts, outcome.found.origin))
     size = request.options.max_output_size
-    pinholes = {
-        number: capture_writer.make_undistortion(lens, size).intrinsics for number, lens in _lenses(model).items()
-    }
+    pinholes = {number: capture_writer.straight_camera(lens, size) for number, lens in _lenses(model).items()}
     capture_writer.write_model(output, model, pinholes)
     write_json(
         output / RECONSTRUCTION_FILE,
@@ -429,10 +427,9 @@ def _write_images(
     names: dict[int, list[str]] = {}
     for image in sorted(capture_writer.placed_images(model), key=lambda image: image.name):
         names.setdefault(image.camera_id, []).append(image.name)
-    lenses = {number: capture_writer.make_undistortion(lens, max_size) for number, lens in _lenses(model).items()}
     total = sum(map(len, names.values()))
     with report_progress(work, console, "writing", total, "without distortion, ") as tell:
-        capture_writer.write_images(output, work, names, lenses, prepared.threads, tell)
+        capture_writer.write_images(output, work, names, _lenses(model), max_size, prepared.threads, tell)
 
 
 def _georef(report: ReconstructionReport, origin: tuple[float, float, float] | None) -> dict[str, Any]:
