@@ -21,7 +21,7 @@ def test_one_map_is_in_memory_at_a_time_and_none_is_made_of_photographs_that_are
     lenses = {k: Intrinsics("SIMPLE_RADIAL", (100.0 + k, 80.0, 60.0, -0.02), 160, 120) for k in range(1, 5)}
     names = {k: [f"{k}a.jpg", f"{k}b.jpg"] for k in lenses}
     work.images.mkdir(parents=True)
-    for name in sum(names.values(), []):
+    for name in (name for group in names.values() for name in group):
         cv2.imwrite(str(work.images / name), np.full((120, 160, 3), 128, np.uint8))
     make = capture_writer.make_undistortion
 

@@ -146,7 +146,7 @@ def _find_features(
     images = [image for group in groups for image in group.images]
     feature_extraction.create_database(bent, groups)
     write_on_white(photographs, bent)
-    _refuse_damaged(feature_extraction.write_upright_images(bent, images))
+    _refuse_damaged(feature_extraction.write_upright_images(bent, images, threads))
     if not work.is_done(FEATURES, keys[FEATURES]):
         mask_files.write_upright_masks(bent, images, threads)
         there = feature_extraction.count_features(bent)

@@ -199,7 +199,7 @@ def _place_anew(
     kinds, finished = feature_extraction.group_by_camera(photographs), Workspace(output)
     if not finished.is_done("capture", keys["capture"]) or _lens_moved(output, found.model):
         work = Workspace(output / WORK_FOLDER)
-        feature_extraction.write_upright_images(work, photographs)
+        feature_extraction.write_upright_images(work, photographs, prepared.threads)
         mask_files.write_upright_masks(work, photographs, prepared.threads)
         finished.begin("placed", keys["placed"])
         finished.begin("capture", keys["capture"])  # until all photographs are of this lens
@@ -293,7 +293,7 @@ def _features(
 ) -> list[ExcludedImage]:
     options, photographs = plan.request.options, plan.image_list.images
     feature_extraction.create_database(workspace, camera_groups)
-    failed = feature_extraction.prepare_images(workspace, photographs, console)
+    failed = feature_extraction.prepare_images(workspace, photographs, plan.threads, console)
     counts = feature_extraction.count_features(workspace)
     if not workspace.is_done("features", key):
         mask_files.write_upright_masks(workspace, photographs, plan.threads)
