@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from rich.console import Console
 
@@ -17,13 +18,14 @@ pytest.importorskip("embreex")
 from support.flights import ORIGIN, Flight, copy_folder, sightings, write_photograph
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import is_capture
-from vdgs.captures.reconstruction import read_reconstruction, report_rows
+from vdgs.captures.reconstruction import MAPPED, read_reconstruction, report_rows
 from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.runs.run_folder import RunFolder
-from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, workspace
+from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, scale_bars, workspace
+from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.system.atomic_files import write_json
 
@@ -183,6 +185,20 @@ def test_a_known_distance_and_positions_agree_or_are_refused(nine, capture, mark
     assert facts.origin is not None
     with pytest.raises(CaptureError, match=r"3\.[12]\d* times as large.*in feet.*--georeference off"):
         again(nine, capture, scale_bar=bars(tmp_path / "feet.txt", nine, marks, 1 / 0.3048))
+
+
+def test_some_of_many_points_tell_how_far_what_photographs_show_is(nine, capture, marks, tmp_path, monkeypatch):
+    """The limits of a known distance come of it; thousands of photographs times millions of points would last."""
+    model, collection = pycolmap.Reconstruction(capture / MAPPED), collect_images((nine.folder,))
+    distances = scale_bars.read_scale_bars(bars(tmp_path / "bars.txt", nine, marks), collection)
+    all_points = scale_bars.known_scale(model, distances)
+    monkeypatch.setattr(scale_bars, "MAX_POINTS", model.num_points3D())
+    assert scale_bars.known_scale(model, distances) == all_points
+    monkeypatch.setattr(scale_bars, "MAX_POINTS", 50)
+    measured, norm = [], np.linalg.norm
+    monkeypatch.setattr(np.linalg, "norm", lambda array, **how: measured.append(len(array)) or norm(array, **how))
+    assert scale_bars.known_scale(model, distances) == pytest.approx(all_points, rel=0.02)
+    assert max(measured) <= 50 < model.num_points3D()
 
 
 BAD_BARS = {
