@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -69,6 +69,8 @@ from vdgs.system.records import record_to_dict
 
 #: A lens that moves pixels by no more leaves the photographs without distortion as they are.
 LENS_PX = 0.05
+#: What the same command has left to do of a capture: nothing, to place a finished one anew, or to make it or go on.
+WorkLeft = Literal["nothing", "placing", "all"]
 
 
 def reconstruct(
@@ -92,19 +94,17 @@ def reconstruct(
     prepared, digests = plan_reconstruction(request), read_digests(output)
     work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared, digests)
     sources = SourceImages.of(request.image_folders, digests, command)
-    facts = read_reconstruction(output) if _is_finished(output, keys["placed"]) else None
-    if facts is not None:
-        console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
+    left = _work_left(prepared, keys, sources, run)
+    before = None if left == "all" else read_reconstruction(output)
+    if before is not None and left == "nothing":
+        console.print(describe_work_left(request, left), highlight=False)
         if SourceImages.read(output) != sources:  # of files that are not used
             sources.write(output)
         with suppress(VdgsError):  # it saves reading, and the folder may be read-only
             digests.write()
         if not request.keep_intermediate:
             work.remove()
-        return facts
-    check_unchanged(output, sources, request.overwrite)
-    check_nothing_trained(request, run)
-    before = _placed_before(output, keys["capture"])
+        return before
     if before is not None:
         began = time.monotonic()
         found = _placed_again(prepared, before)  # may be refused: before anything is deleted or noted
@@ -134,6 +134,41 @@ def reconstruct(
         facts = _steps(prepared, work, keys, console)
     print_reconstruction_report(facts, console)
     return facts
+
+
+def look_at_work(request: SfmRequest, run: RunFolder | None) -> tuple[ReconstructionPlan, WorkLeft]:
+    """The look before the work, and what `reconstruct` has left to do, of frames in place of films; nothing is written.
+    Raises what it raises before its work."""
+    prepared, output = plan_reconstruction(request), request.output
+    if SourceImages.read(output) is None and read_reconstruction(output) is None:  # no need to read all photographs
+        check_nothing_trained(request, run)
+        return prepared, "all"
+    digests = read_digests(output)
+    sources = SourceImages.of(request.image_folders, digests)
+    return prepared, _work_left(prepared, step_keys(prepared, digests), sources, run)
+
+
+def describe_work_left(request: SfmRequest, left: WorkLeft) -> str:
+    """What happens to the capture that is there; empty where none is finished."""
+    if read_reconstruction(request.output) is None:
+        return ""
+    return {
+        "nothing": f"{request.output}: made of these photographs already; nothing to do",
+        "placing": f"{request.output}: is placed anew, in seconds; its photographs and poses stay",
+        "all": f"{request.output}: was made of other photographs or with other settings (--sfm.*); it is made anew",
+    }[left]
+
+
+def _work_left(
+    prepared: ReconstructionPlan, keys: dict[str, str], sources: SourceImages, run: RunFolder | None
+) -> WorkLeft:
+    """Raises VdgsError where photographs are others than before, RunError for a run that was trained on the capture."""
+    request, output = prepared.request, prepared.request.output
+    if _is_finished(output, keys["placed"]) and read_reconstruction(output) is not None:
+        return "nothing"
+    check_unchanged(output, sources, request.overwrite)
+    check_nothing_trained(request, run)
+    return "placing" if _is_placed_otherwise(output, keys["capture"]) else "all"
 
 
 @contextmanager
@@ -166,13 +201,11 @@ def _is_finished(output: Path, key: str) -> bool:
     return (output / RECONSTRUCTION_FILE).is_file() and Workspace(output).is_done("placed", key)
 
 
-def _placed_before(output: Path, key: str) -> ReconstructionReport | None:
-    """The facts of a capture of the same photographs that was finished, and is to be placed otherwise."""
+def _is_placed_otherwise(output: Path, key: str) -> bool:
+    """Whether a capture of the same photographs was finished, and is to be placed anew."""
     finished = Workspace(output)
     is_capture = finished.is_done("capture", key) or finished.is_begun("capture", key)  # being placed anew
-    if not (is_capture and (output / RECONSTRUCTION_FILE).is_file() and (output / MAPPED).is_dir()):
-        return None
-    return read_reconstruction(output)
+    return is_capture and (output / MAPPED).is_dir() and read_reconstruction(output) is not None
 
 
 def _placed_again(prepared: ReconstructionPlan, before: ReconstructionReport) -> Georeferenced:
