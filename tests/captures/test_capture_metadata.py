@@ -44,12 +44,3 @@ def test_masks_that_are_added_edited_or_removed_make_another_capture(tmp_path):
         check_same_capture(tmp_path / "capture.json", masked, read())
     check_same_capture(tmp_path / "capture.json", plain, read())
     assert "masks" not in capture_fingerprint(read())
-
-
-def test_runs_of_before_masks_counted_go_on(tmp_path):
-    write_colmap(tmp_path, tiny_scene(width=64, height=48))
-    write_mask(tmp_path, 30)
-    capture = load_capture(tmp_path, CaptureOptions())
-    before = capture_metadata(capture)
-    del before["masked_views"], before["fingerprint"]["masks"]
-    check_same_capture(tmp_path / "capture.json", before, capture)

@@ -13,9 +13,6 @@ from vdgs.captures.capture import Capture, View
 from vdgs.errors import RunError
 from vdgs.system.documents import CaptureMetadata
 
-#: The part of a fingerprint that captures with masks have.
-MASKS = "masks"
-
 
 def capture_metadata(capture: Capture) -> CaptureMetadata:
     """What capture.json and a model say about where they come from."""
@@ -24,7 +21,7 @@ def capture_metadata(capture: Capture) -> CaptureMetadata:
         "root": str(capture.root), "source": capture.source, "images": capture.images,
         "training_views": [view.name for view in capture.train_views],
         "test_views": [view.name for view in capture.test_views],
-        "masked_views": len(_masks(capture)), "points": len(capture.points),
+        "points": len(capture.points),
         "ground_frame": {
             "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
             "metric": ground.metric, "how": ground.description, "origin_geo": ground.origin_geo,
@@ -44,8 +41,9 @@ def capture_fingerprint(capture: Capture) -> dict[str, int]:
         "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
         "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
-    masks = _masks(capture)
-    return parts | ({MASKS: _crc(*(f"{name}:{mask.stat().st_size}" for name, mask in masks.items()))} if masks else {})
+    if masks := _masks(capture):
+        parts["masks"] = _crc(*(f"{name}:{mask.stat().st_size}" for name, mask in masks.items()))
+    return parts
 
 
 def photographs_crc(views: Sequence[View]) -> int:
@@ -62,8 +60,6 @@ def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any]
             "vdgs run CAPTURE --output RUN"
         )
     now = capture_fingerprint(capture)
-    if "masked_views" not in (before or {}):  # written when masks did not count: nobody knows what they were
-        now.pop(MASKS, None)
     changed = [part for part in {**now, **known} if known.get(part) != now.get(part)]
     if changed:
         raise RunError(

@@ -188,8 +188,7 @@ def is_off_path_measured(context: RunContext, name: ModelName) -> bool:
     be added or replaced after the training, which does without them."""
     views = context.capture.off_path_views
     record = read_json_or_empty(evaluation_folder(context.run, name, "off-path") / "status.json")
-    now = photographs_crc(views)
-    return not views or (bool(record) and record.get("photographs", now) == now)  # older versions did not say
+    return not views or record.get("photographs") == photographs_crc(views)
 
 
 def _evaluate_here(context: RunContext, evaluation: _Evaluation, console: Console) -> int:

@@ -28,8 +28,6 @@ class CaptureMetadata(TypedDict, total=False):
     images: str
     training_views: list[str]
     test_views: list[str]
-    #: Photographs with a mask; older files do not say it, nor have a part for masks in the fingerprint.
-    masked_views: int
     points: int
     ground_frame: GroundFrameDocument
     warnings: list[str]
