@@ -1,7 +1,8 @@
-"""A model that is bent by positions keeps what other things say better: up along a line, and a known distance."""
+"""Models placed by positions and, bent by them, kept where other things say more: up along a line, a known distance."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,10 +10,11 @@ import pytest
 
 from support.flown_models import flown_model, sightings
 from vdgs.config.sfm_options import SfmOptions
+from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.geometry.similarity import Similarity
 from vdgs.sfm import georeferencing, georegistration
 from vdgs.sfm.bending import bend_to_positions
-from vdgs.sfm.gcp_list import GcpObservation, GroundControlPoint
+from vdgs.sfm.gcp_list import GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.scale_bars import ScaleBars, known_scale
@@ -39,10 +41,14 @@ def tilt_deg(model: pycolmap.Reconstruction, photographs: list[SimpleNamespace])
 
 
 def georeferenced(
-    model: pycolmap.Reconstruction, photographs: list[SimpleNamespace], positions: GpsPriors, bars: ScaleBars | None
+    model: pycolmap.Reconstruction,
+    photographs: list[SimpleNamespace],
+    positions: GpsPriors,
+    bars: ScaleBars | None,
+    gcps: GcpList | None = None,
 ) -> Georeferenced:
     prepared = SimpleNamespace(
-        gcps=None, scale_bars=bars, image_list=SimpleNamespace(images=photographs), gps_priors=positions, threads=1,
+        gcps=gcps, scale_bars=bars, image_list=SimpleNamespace(images=photographs), gps_priors=positions, threads=1,
         request=SimpleNamespace(options=SfmOptions(), gps=None), origin=positions.origin,
         preflight=SimpleNamespace(height_m=None),
     )  # fmt: skip
@@ -102,3 +108,40 @@ def test_a_bowl_is_flattened_by_positions(bent):
     off = centers - places
     assert bent == [True]
     assert np.sqrt(((off - [0, 0, off[:, 2].mean()]) ** 2).sum(axis=1).mean()) < 0.05  # 0 is the ground's height
+
+
+def test_a_line_is_one_though_a_position_lies_beside_it():
+    """Altitudes that drift along one line are said, whatever a single position is wrong by; as is the edge."""
+    rng = np.random.default_rng(5)
+    places = np.array([[20.0 * k, 0, 80] for k in range(16)]) + rng.normal(0, 0.5, (16, 3))
+    model, photographs = flown_model(places, rng)
+    recorded = places + rng.normal(0, 1.0, places.shape)
+    recorded[:, 2] += np.linspace(-8, 8, 16)
+    beside = recorded + np.outer(np.arange(16) == 6, [0, 300.0, 0])
+    plain, stray = (
+        georegistration.georegister(model, photographs, priors(each, 3, False)) for each in (recorded, beside)
+    )
+    assert stray.inliers.sum() == 15
+    assert "along one line" in plain.method
+    assert "along one line" in stray.method
+    assert stray.accuracy.place_m[1] == pytest.approx(plain.accuracy.place_m[1], rel=0.2)
+    assert stray.accuracy.scale_m / stray.accuracy.scale_percent == pytest.approx(
+        plain.accuracy.scale_m / plain.accuracy.scale_percent, rel=0.05
+    )
+
+
+def test_check_points_are_measured_in_the_plane_where_no_altitude_is_known():
+    rng = np.random.default_rng(0)
+    places = np.array([[20.0 * (k % 4), 20.0 * (k // 4), 80] for k in range(12)]) + rng.normal(0, 0.5, (12, 3))
+    model, photographs = flown_model(places, rng)
+    marks = tuple(GcpObservation(name, tuple(pixel)) for name, pixel in sightings(model, np.array([30.0, 20, 3])))
+    geodetic = geodetic_from_enu(np.array([[30.0, 20, 323]]), (50.0, 8.0, 0.0))[0]
+    control = GcpList((GroundControlPoint("a", tuple(geodetic), marks, True),), "EPSG:4326", "gcp.txt", ())
+    for has_altitudes, axes in ((True, 3), (False, 2)):
+        recorded = places + rng.normal(0, 0.5, places.shape) + [0, 0, 320]
+        recorded[:, 2] *= has_altitudes
+        positions = replace(priors(recorded, 1.0, False), has_altitudes=has_altitudes)
+        found = georeferenced(pycolmap.Reconstruction(model), photographs, positions, None, control)
+        (report,) = found.survey
+        assert np.abs(report.residual_m).max() < 2
+        assert len(report.residual_m) == axes

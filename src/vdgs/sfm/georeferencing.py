@@ -69,7 +69,9 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
         return Georeferenced(model, placed, None, ())
     survey: tuple[GcpReport, ...] = ()
     if control is not None and placed.is_georeferenced:
-        survey = gcp_adjustment.measure_gcps(model, control, prepared.origin, doubtful)
+        survey = gcp_adjustment.measure_gcps(
+            model, control, prepared.origin, doubtful, _knows_altitude(prepared, placed)
+        )
     ground = float(np.median(georegistration.model_points(model)[:, 2]))
     _refuse_upside_down(model, ground, placed, prepared)
     georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))

@@ -109,6 +109,7 @@ def georegister(
         centers=centers,
         targets=targets,
         times=_moments(taken),
+        flights=positions.flights[rows] if len(positions.flights) == len(positions) else None,
         up=up,
         scale=scale,
         stated=positions.gps_std[rows] if stated else None,
@@ -132,7 +133,7 @@ def georegister(
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
     fit, of_reading = _checked_reading(fit, problem, positions, offsets)
-    on_a_line = is_nearly_collinear(targets, positions.gps_std[rows])
+    on_a_line = is_nearly_collinear(targets[fit.inliers], positions.gps_std[rows][fit.inliers])
     fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
     fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
@@ -152,7 +153,7 @@ def georegister(
         targets=fit.placed - fit.residuals,
         residuals=_recorded(fit.placed - levelled.targets, positions),
         inliers=fit.inliers,
-        accuracy=accuracy_of(fit, targets, positions, offsets),
+        accuracy=accuracy_of(fit, positions, offsets),
         notes=tuple(notes),
     )
 
@@ -170,12 +171,10 @@ def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
     return values if positions.has_altitudes else values[..., :2]
 
 
-def accuracy_of(
-    fit: PositionFit, targets: np.ndarray, positions: GpsPriors, offsets: AltitudeOffsets | None = None
-) -> AccuracyFacts:
-    """The accuracy of a fit, for people."""
+def accuracy_of(fit: PositionFit, positions: GpsPriors, offsets: AltitudeOffsets | None = None) -> AccuracyFacts:
+    """The accuracy of a fit, for people; the edge of the flight is where photographs are, not stray positions."""
     place = fit.place_error_m if positions.has_altitudes else fit.place_error_m[:1]
-    away = np.linalg.norm(targets[:, :2] - targets[:, :2].mean(axis=0), axis=1)
+    away = np.linalg.norm(fit.placed[:, :2] - fit.placed[:, :2].mean(axis=0), axis=1)
     return AccuracyFacts(
         place_m=place, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
         north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
