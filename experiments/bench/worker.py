@@ -76,8 +76,10 @@ def _coarse(at: _JobContext) -> None:
 
 def _partition(at: _JobContext) -> None:
     from vdgs.pipeline.count_visibility import count_run_visibility
+    from vdgs.pipeline.find_motion import find_run_motion
     from vdgs.pipeline.partition_stage import partition_run
 
+    find_run_motion(at.context, at.console, at.job.device)
     count_run_visibility(at.context, at.console)
     partition_run(at.context, at.console, at.job.device)
 

@@ -29,7 +29,7 @@ OF_OTHERS = {
         "--format",
         "--parsable",
     },
-    "slurm_executor.py": {"--requeue"},
+    "slurm_executor.py": {"--requeue", "--exclude"},
     "crs.py": {"--file"},
     "launch.py": {"--std"},
     "nvrtc.py": {"--gpu-architecture"},
@@ -113,7 +113,7 @@ def test_a_verb_names_an_option_that_it_lacks_only_with_those_that_have_it(verb)
 
 
 def test_what_all_verbs_say_of_a_run_is_said_as_a_command():
-    """Few verbs have --output, and `view` no --capture: what a run says of itself, any verb may print."""
+    """Few verbs have --output, and not all --capture: what a run says of itself, any verb may print."""
     for file, text in texts_with_options():
         of_run = file.startswith("runs/") and file != "runs/settings_file.py"  # which `vdgs config` writes
         if " " in text and (of_run or file == "captures/capture_metadata.py"):

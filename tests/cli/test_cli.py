@@ -22,7 +22,12 @@ from vdgs.cli.export_cmd import ExportArguments
 from vdgs.cli.help_text import COMMON_OPTIONS
 from vdgs.cli.main import COMMANDS, HELP, get_command, main, verb_arguments
 from vdgs.cli.run_cmd import NOT_KEPT, RunArguments
+from vdgs.cli.start_settings import start_settings
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.options import Option, options_of
+from vdgs.config.presets import PRESETS
+from vdgs.runs.config_file import run_command as written_command
+from vdgs.runs.run_settings import RunSettings
 
 #: Modules of those that take long to import, in the order in which they are, and what each imports only when needed: of
 #: each of two processes.
@@ -198,13 +203,27 @@ def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
         ]  # fmt: skip
 
 
-def test_the_command_that_is_kept_says_the_same():
-    typed = ["A", "B", "-o", "R", "--sfm.check-points", "P4", "P7", "--slurm.sbatch-args", "--qos=long", "--exclusive"]
-    given = parse_words(RunArguments, typed)
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--sfm.check-points", "P4", "P7", "--slurm.sbatch-args", "--qos=long", "--exclusive"],
+        ["--images=--odd", "--slurm.sbatch-args", "--qos=long"],
+    ],
+)
+def test_the_command_that_is_kept_says_the_same(options):
+    given = parse_words(RunArguments, ["A", "B", "-o", "R", *options])
     again = parse_words(RunArguments, shlex.split(given.command_line("run"))[2:])
     absolute = {path: again.values[path] for path in (("capture",), ("output",), ("extra_image_folders",))}
     assert absolute["extra_image_folders",] == (Path("B").resolve(),)
     assert again.values == given.values | absolute
+
+
+@pytest.mark.parametrize("name", ["--odd", "-o", "~x", "7"])
+def test_the_command_that_is_written_for_a_run_asks_for_its_settings(name):
+    options = CaptureOptions(images=name, max_images=12)
+    settings = RunSettings.create("/place", options, PRESETS["laptop"])
+    given = parse_words(RunArguments, shlex.split(written_command(settings, Path("R")))[2:])
+    assert given.over(start_settings(given).layer()).options == options
 
 
 def test_more_folders_of_photographs_are_used_wherever_they_stand():

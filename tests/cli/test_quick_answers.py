@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +18,12 @@ from support.commands import PATIENCE_SECONDS
 from support.small_pipeline import NativeRun, vdgs
 from vdgs.cli.argument_parser import parse_words
 from vdgs.cli.main import COMMANDS, main, verb_arguments
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MergeConfig
-from vdgs.pipeline.finished_run import nothing_to_do
+from vdgs.pipeline.finished_run import _input_times, nothing_to_do
 from vdgs.runs.run_folder import RunFolder
+from vdgs.system.atomic_files import write_json
 from vdgs.system.similar_paths import suggest_path
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy", "sklearn", "shapely", "rasterio", "PIL")
@@ -195,3 +198,53 @@ def test_a_path_is_suggested_where_a_part_of_it_is_mistyped(tmp_path):
     assert suggest_path(tmp_path / "crad" / "DCIM") == f"; did you mean {tmp_path / 'card' / 'DCIM'}?"
     assert suggest_path(tmp_path / "card" / "dcim") == f"; did you mean {tmp_path / 'card' / 'DCIM'}?"
     assert suggest_path(tmp_path / "card" / "quite another") == ""
+
+
+def set_time(file: Path, seconds_from_now: int) -> None:
+    when = time.time_ns() + seconds_from_now * 10**9
+    os.utime(file, ns=(when, when))
+
+
+@pytest.mark.parametrize("where", ["linked folder", "folder of a project"])
+def test_photographs_that_lie_elsewhere_are_looked_at_too(native_small: NativeRun, tmp_path, where):
+    run, card = shutil.copytree(native_small.whole, tmp_path / "run"), tmp_path / "card"
+    capture = shutil.copytree(native_small.capture, tmp_path / "capture")
+    RunFolder(run).move_capture(capture)
+    shutil.move(capture / "images", card)
+    if where == "linked folder":
+        (capture / "images").symlink_to(card)
+        (card / "around").symlink_to(tmp_path)
+    cameras = json.loads((run / "cameras.json").read_text())
+    write_json(run / "cameras.json", cameras | {"input_folders": [str(card)] if where != "linked folder" else []})
+    own = RunFolder(run).settings()
+    asked = RunRequest(capture=capture, output=run, ortho=False, options=own.capture, **vars(own.method))
+    vdgs("report", run)
+    set_time(run / "capture.json", 100)
+    assert nothing_to_do(asked, "").startswith("nothing to do")
+    set_time(next(card.glob("*.png")), 200)
+    assert nothing_to_do(asked, "") == ""
+
+
+def test_a_folder_that_an_option_names_is_looked_at_with_all_below(tmp_path):
+    place, mask = tmp_path / "place", tmp_path / "masks" / "below" / "new.png"
+    place.mkdir()
+    mask.parent.mkdir(parents=True)
+    mask.touch()
+    set_time(mask, 100)
+    request = RunRequest(
+        capture=place, output=tmp_path / "run", options=CaptureOptions(masks=str(tmp_path / "masks"))
+    )  # fmt: skip
+    assert max(_input_times(request, ())) == mask.stat().st_mtime_ns
+
+
+def test_settings_that_the_coarse_stage_leaves_as_they_are_are_named(native_small: NativeRun, tmp_path, capsys):
+    run, file = shutil.copytree(native_small.whole, tmp_path / "run"), tmp_path / "five.yaml"
+    file.write_text("partition: {blocks: 5}\nblock: {iterations: 77}\n")
+    before = (run / "config.yaml").read_text()
+    again = ("train-coarse", native_small.capture, "--output", run)
+    vdgs(*again, "--config", file)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "keeps its settings of later stages (--block.iterations: 10 -> 77, --blocks: 2 -> 5): `vdgs run`" in said
+    vdgs(*again)
+    assert "later stages" not in capsys.readouterr().out
+    assert (run / "config.yaml").read_text() == before

@@ -273,6 +273,36 @@ def test_shards_of_other_jobs_go_unless_they_are_at_work(tmp_path):
     assert wanted.folder.exists()
 
 
+def test_a_gathered_job_goes_where_open_files_keep_their_folder(tmp_path, monkeypatch):
+    """NFS renames a file that is removed while a process has it open, and its folder is not empty then."""
+    plain = os.unlink
+
+    def unlink(path, *, dir_fd=None):
+        folder = Path(path).parent if dir_fd is None else Path(os.readlink(f"/proc/self/fd/{dir_fd}"))
+        file = (folder / Path(path).name).resolve()
+        handles = [Path("/proc/self/fd") / number for number in os.listdir("/proc/self/fd")]
+        if any(os.path.realpath(handle) == str(file) for handle in handles):
+            file.rename(file.with_name(f".nfs{len(handles):08x}"))
+        else:
+            plain(path, dir_fd=dir_fd)
+
+    monkeypatch.setattr(os, "unlink", unlink)
+    monkeypatch.setattr(Path, "unlink", lambda path, missing_ok=False: unlink(path) if path.exists() else None)
+    job, other = (job_of(tmp_path, name) for name in ("this", "that"))
+    with job.exclusive():
+        job.mark_queued()
+    assert not list(tmp_path.iterdir())
+    with job.exclusive():
+        job.mark_queued()
+        log = (job.shard(0).path / "output.log").open("w")  # of a shard that has not ended yet
+    (kept,) = job.shard(0).path.iterdir()
+    log.close()
+    kept.unlink()  # as NFS does once nobody has it open
+    with other.exclusive():
+        pass
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_a_person_keeps_in_a_folder_of_that_name_stays(tmp_path):
     """A folder for maps may be any: `shards` in it may hold a chess set, folders named by digests, links to others."""
     theirs = [tmp_path / "shards" / name for name in ("rook.png", "white/king.png", "0123456789ab/queen.png")]

@@ -16,6 +16,7 @@ from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import BlockConfig, DensifyConfig, MethodConfig, max_block_anchors
 from vdgs.config.validation_rules import validate_config
 from vdgs.pipeline.count_visibility import count_run_visibility
+from vdgs.pipeline.find_motion import find_run_motion
 from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.partition_stage import partition_run
 from vdgs.pipeline.train_block import train_block
@@ -85,6 +86,7 @@ def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, in
     context = create_or_resume_run(capture, output, CaptureOptions(), eager(max_anchors))
     run = context.run
     train_coarse(context, CheckpointOptions(), console)
+    find_run_motion(context, console)
     count_run_visibility(context, console)
     partition_run(context, console)
     for index in range(len(run.partition_record().blocks)):

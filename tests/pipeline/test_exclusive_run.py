@@ -24,11 +24,13 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.presets import PRESETS
 from vdgs.config.serialization import to_dict
+from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import RunError
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.runs.create_or_resume import create_or_resume_run, exclusive_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
+from vdgs.sfm.reconstruct import writing
 from vdgs.system.atomic_files import write_json
 
 #: Another process that drives a run: it holds the lock of which it is told until its input ends.
@@ -124,6 +126,21 @@ def test_a_block_is_trained_beside_who_drives_the_run(run, capsys):
     with driven_elsewhere(run):
         assert command_line("train-blocks", run.path, "--block", "0") == 1
     assert "vdgs partition" in capsys.readouterr().err  # it is not refused for its driver
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_what_blocks_at_work_need_is_not_discarded_for_another_capture(run, shared):
+    """Blocks that a driver began which died share the run; `vdgs run PHOTOGRAPHS --overwrite` is another process."""
+    run.own_capture.mkdir()
+    (run.own_capture / ".lock").touch()
+    request = SfmRequest(image_folders=(run.path / "DCIM",), output=run.own_capture, overwrite=True)
+    with run.drive_lock(), run.locked():
+        before = contents(run)
+    with run.locked(shared), pytest.raises(RunError, match=AT_WORK), writing(request, run):
+        pytest.fail("photographs are reconstructed")
+    assert contents(run) == before
+    with writing(request, run):
+        assert not run.block(0).has_output()
 
 
 def test_who_takes_a_run_up_drives_it(place, tmp_path):

@@ -9,25 +9,31 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from support.small_pipeline import BLOCK, SETTINGS, vdgs
+from support.small_pipeline import BLOCK, CUT, SETTINGS, train_coarse, vdgs
+from vdgs.captures.capture_metadata import capture_fingerprint
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import OrthoRequest, RunRequest
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import BlockConfig, MethodConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.evaluation.moving_pixels import MIN_MOVING_SHARE, SAMPLED_PHOTOGRAPHS
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.ops.api import train
 from vdgs.pipeline import find_motion
 from vdgs.pipeline.run_estimate import Scene, _other_times
 from vdgs.pipeline.time_estimate import MOTION_VIEW_SECONDS, MOTION_VIEW_STEPS
+from vdgs.pipeline.train_block import train_block
 from vdgs.rendering.ortho.ortho_plan import OrthoPlan
 from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.run_context import RunContext
-from vdgs.runs.run_folder import MOTION_FILE
+from vdgs.runs.run_folder import MOTION_FILE, RunFolder
 from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_keys import stage_keys
 from vdgs.system.processor_time import Cost
 
@@ -50,6 +56,9 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys, monkeypatch):
     context, config = RunContext.from_path(run), run / "config.yaml"
     still = context.run.keys()
     monkeypatch.setattr(find_motion, "MIN_MOVING_SHARE", 0.1)
+    with pytest.raises(RunError, match=r"vdgs visibility .*--block\.mask-moving off"):  # not known yet
+        with_motion_masks(context.run, context.capture)
+    assert with_motion_masks(context.run, context.capture, needed=False) is context.capture
     vdgs("visibility", run)
     sampled = json.loads((run / MOTION_FILE).read_text())
     assert not sampled["masked"]
@@ -87,6 +96,8 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys, monkeypatch):
 
     vdgs("partition", run, "--blocks", "1")
     vdgs("train-blocks", run, "--block", "0", *BLOCK)
+    trained = AnchorModel.load(context.run.block(0).model).metadata.capture
+    assert trained["fingerprint"] == capture_fingerprint(context.capture)  # of its own masks, not of these
     vdgs("report", run)
     assert "What moves" in (run / "report.html").read_text()
     config.write_text(config.read_text().replace("mask_moving: 'on'", "mask_moving: auto"))
@@ -104,6 +115,26 @@ def test_blocks_leave_out_what_moves(tmp_path, capsys, monkeypatch):
     config.write_text(config.read_text().replace("mask_moving: auto", "mask_moving: 'off'"))
     vdgs("visibility", run)
     assert not (run / MOTION_FILE).parent.exists()
+
+
+def test_the_cut_finds_what_moves_before_blocks_are_trained(tmp_path, monkeypatch):
+    capture, run = tmp_path / "capture", RunFolder(tmp_path / "run")
+    write_colmap(capture, tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    train_coarse(capture, run.path)
+    monkeypatch.setattr(find_motion, "MIN_MOVING_SHARE", 0.0)
+    vdgs("partition", run.path, *CUT)
+    cut = run.keys()
+    assert json.loads(run.motion_file.read_text())["enough"]
+    assert get_run_status(run).of("visibility").state == "done"
+    assert not get_run_status(run).next_command().startswith("vdgs visibility")
+    vdgs("visibility", run.path)
+    assert run.keys() == cut
+    run.motion_file.unlink()
+    vdgs("partition", run.path)  # to look at a cut, as of a run of before, searches nothing
+    assert not run.motion_file.exists()
+    with pytest.raises(RunError, match="vdgs visibility"):
+        train_block(RunContext.from_path(run.path), 0, CheckpointOptions(), Console(quiet=True))
+    assert not run.block(0).has_output()
 
 
 def test_the_setting_counts_by_what_it_does():

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
 from vdgs.cli.main import main
+from vdgs.cli.result_cmds import view_command
 from vdgs.cli.start_settings import start_settings
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RenderRequest
@@ -339,3 +340,11 @@ def test_weights_that_are_not_there_are_said_before_any_work(trained, tmp_path, 
     assert ended.value.code == 1
     assert "--lpips-weights nowhere.pth: no such file" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_capture_that_moved_is_named_to_view_too(folder, monkeypatch):
+    shown = []
+    monkeypatch.setattr("vdgs.viewer.server.view_run", lambda request, console: shown.append(open_run(request.run)))
+    view_command([str(folder / "run"), "--capture", str(folder / "place")])
+    assert [each.capture.root for each in shown] == [folder / "place"]
+    assert RunFolder(folder / "run").settings().capture_path == str(folder / "place")

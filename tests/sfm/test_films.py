@@ -301,6 +301,17 @@ def test_a_look_writes_nothing_into_the_output(flight: Path, tmp_path: Path):
         pass
 
 
+def test_a_look_at_what_is_begun_takes_the_frames_that_are_there(flight: Path, tmp_path: Path):
+    request, said = ask(tmp_path / "out", flight), Console(file=io.StringIO())
+    taken = with_frames(request, said)
+    before = {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*")}
+    with temporary_frames(request, said) as look:
+        assert look == taken
+    with temporary_frames(replace(request, options=replace(request.options, num_frames=5)), said) as look:
+        assert look.image_folders != taken.image_folders
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*")} == before
+
+
 def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path):
     film = tmp_path / "DJI_2.MOV"
     moments = [0.1 * k + (0.7 if k > 15 else 0) for k in range(30)]

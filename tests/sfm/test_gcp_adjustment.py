@@ -28,7 +28,7 @@ from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.sfm import capture_writer, incremental_mapper
 from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.feature_extraction import CameraGroup
-from vdgs.sfm.gcp_adjustment import fit_to_gcps, gcp_accuracy, no_better_than_left, triangulate
+from vdgs.sfm.gcp_adjustment import Level, fit_surveyed, fit_to_gcps, gcp_accuracy, no_better_than_left, triangulate
 from vdgs.sfm.gcp_list import (
     GcpList,
     GcpObservation,
@@ -342,6 +342,23 @@ def test_the_stated_accuracy_of_few_points_holds(count, wrong):
         beyond += [100 * abs(found.scale - 1) > stated.scale_percent, np.hypot(*off[:2]) > stated.place_m[0],
                    off[2] > stated.place_m[1]]  # fmt: skip
     assert (beyond <= 0.1 * surveys).all()
+
+
+@pytest.mark.parametrize(("count", "heights"), [(3, 0), (3, 1), (3, 2), (4, 2), (4, 4)])
+def test_known_heights_that_level_nothing_make_the_stated_accuracy_no_better(count, heights):
+    """Of 95 % stated, 92 to 98 hold, for north and for scale."""
+    rng, within, trials = np.random.default_rng(count + heights), np.zeros(2), 600
+    level = Level(up=np.array([0, 0, 1.0]), deviation_deg=1.0, gps=None, gps_up_m=None)
+    for _ in range(trials):
+        places = np.column_stack([rng.uniform(-100, 100, (count, 2)), rng.uniform(0, 5, count)])
+        targets = places + rng.normal(0, 0.03, places.shape)
+        targets[heights:, 2] = np.nan
+        fit = fit_surveyed(places, targets, level)
+        north = np.degrees(np.arctan2(fit.similarity.rotation[1, 0], fit.similarity.rotation[0, 0]))
+        scale = 100 * (fit.similarity.scale - 1)
+        within += np.abs([north, scale]) <= [fit.accuracy.north_deg, fit.accuracy.scale_percent]
+    assert (within >= 0.92 * trials).all()
+    assert (within <= 0.98 * trials).all()
 
 
 def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path | None, *held_out: str):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vdgs.captures import reconstruction
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions, radius_95
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
@@ -315,8 +316,36 @@ def test_small_drifts_of_a_receiver_with_rtk_are_said_with_their_digits():
     drift, good = map(float, re.search(r"drift by ([+-][\d.]+) m .* good to ±([\d.]+) m", note).groups())
     assert drift == pytest.approx(fit.drift_m, rel=0.05)
     assert good == pytest.approx(fit.place_error_m[1], rel=0.05)
-    accuracy = georegistration.accuracy_of(fit, recorded, SimpleNamespace(has_altitudes=True))
+    accuracy = georegistration.accuracy_of(fit, SimpleNamespace(has_altitudes=True))
     assert f"altitudes drift by {drift} m" in dict(reconstruction._accuracy_rows(accuracy))["Positions are good to"]
+
+
+@pytest.mark.parametrize("spreads", [(1.0,), (1.0, 1.0), (1.0, 3.0), (1.0, 0.1)])
+@pytest.mark.parametrize("free", [4, 12, math.inf])
+def test_stated_distances_hold_95_percent_of_errors_whose_size_is_found(spreads, free):
+    rng, trials = np.random.default_rng(0), 4000
+    errors = rng.normal(size=(trials, len(spreads))) * spreads
+    found = np.sqrt(rng.chisquare(free, trials) / free) if math.isfinite(free) else np.ones(trials)
+    stated = [radius_95(np.square(size * np.array(spreads)), free) for size in found]
+    assert 0.93 < (np.linalg.norm(errors, axis=1) <= stated).mean() < 0.97
+
+
+def test_receivers_of_two_drones_that_fly_at_the_same_time_wander_each_on_its_own():
+    """Walks that differ are seen however the clock deals their photographs out."""
+    rng = np.random.default_rng(1)
+    places = np.concatenate([strips(4, 8, 20.0, rng) + beside for beside in ([0, 0, 0], [0, 15, 0])])
+    wander = np.concatenate([np.cumsum(rng.normal(0, 0.4, (32, 3)), axis=0) for _ in range(2)])
+    after, _ = problem_of(places, places + wander, 1)
+    flights = np.repeat([4, 2], 32)
+    dealt = replace(after, times=np.concatenate([np.arange(32), np.arange(32) + 0.5]) / 32, flights=flights)
+    one, other = fit_positions(after), fit_positions(dealt)
+    assert other.scale_error == pytest.approx(one.scale_error, rel=0.05)
+    assert other.scale_error > 1.5 * fit_positions(replace(dealt, flights=None)).scale_error
+    shuffled = rng.permutation(64)
+    assert (
+        replace(dealt, flights=flights[shuffled], times=dealt.times[shuffled]).order.tolist()
+        == np.argsort(shuffled).tolist()
+    )
 
 
 def test_positions_that_are_another_flights_are_left_out():

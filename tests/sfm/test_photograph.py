@@ -239,6 +239,21 @@ def test_positions_that_cannot_be_are_left_out_and_named(tmp_path):
         assert any(name in note and said in note for note in found.notes), found.notes
 
 
+def test_a_road_and_another_site_are_no_strays_but_a_place_where_a_receiver_stuck_is(tmp_path):
+    """A block of 300 m, and from it 6 km of road or a site 5 km off; or a dozen photographs that all say one place."""
+    one = replace(photograph(tmp_path, 0), altitude=500.0)
+    block = np.array([[30.0 * (k % 10), 30.0 * (k // 10), 0] for k in range(100)])
+    road = np.array([[300 + 80.0 * k, 0, 0] for k in range(75)])
+    for more, used in (
+        (road, 175),
+        (block[:40] + np.array([5000, 0, 0]), 140),
+        (np.full((12, 3), [5000.0, 0, 0]), 100),
+    ):
+        places = geodetic_from_enu(np.concatenate([block, more]), ORIGIN)
+        seen = [replace(one, name=f"{k:03}.jpg", lat_lon=tuple(place[:2])) for k, place in enumerate(places)]
+        assert len(positions_of(seen)) == used
+
+
 def test_positions_at_one_place_say_nothing(tmp_path):
     found = positions_of([photograph(tmp_path, k) for k in range(4)])
     assert not found.usable

@@ -5,24 +5,35 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 from rich.console import Console
 
 pytest.importorskip("embreex")
 
-from support.flights import ORIGIN, Flight, copy_folder, sightings, write_photograph
+from support.flights import ORIGIN, Flight, copy_folder, sightings, unestimated, write_photograph
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import is_capture
-from vdgs.captures.reconstruction import read_reconstruction, report_rows
+from vdgs.captures.reconstruction import MAPPED, read_reconstruction, report_rows
 from vdgs.captures.validation import validate_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.method import MethodConfig
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
-from vdgs.errors import CaptureError
+from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
-from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, workspace
+from vdgs.pipeline import dry_run
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import RunSettings
+from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, scale_bars, workspace
+from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
+from vdgs.system.atomic_files import write_json
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]
 
@@ -129,6 +140,54 @@ def test_mirrored_tables_are_refused_and_leave_the_capture_as_it_was(nine, captu
     assert "used all the same" in again(nine, capture, mirrored, georeference="anyway")[1]
 
 
+def test_what_was_trained_is_deleted_only_once_the_new_place_is_not_refused(nine, capture, tmp_path):
+    run = RunFolder(tmp_path / "run")
+    write_json(run.capture_file, {})  # as training leaves it
+    mirrored = table(tmp_path / "north.csv", nine, lambda enu: enu * [1, -1, 1])
+    request = SfmRequest(image_folders=(nine.folder,), output=capture, gps=mirrored, threads=1, overwrite=True)
+    before = files(capture)
+    with pytest.raises(CaptureError, match="mirrored"):
+        reconstruct(request, console(), run, "vdgs run --gps north.csv")
+    assert run.is_trained
+    assert files(capture) == before
+    right = table(tmp_path / "gps.csv", nine, lambda enu: enu + 1)
+    reconstruct(replace(request, gps=right), console(), run, "vdgs run --gps gps.csv")
+    assert not run.is_trained
+
+
+def test_a_look_says_what_is_left_and_refuses_what_the_work_refuses(nine, capture, tmp_path, monkeypatch):
+    gps = table(tmp_path / "gps.csv", nine, lambda enu: enu + 1)
+    shutil.copytree(capture, tmp_path / "run" / "capture", symlinks=True)
+    run, card = RunFolder(tmp_path / "run"), tmp_path / "card"
+    shutil.copytree(nine.folder, card)
+    same = RunRequest(capture=nine.folder, output=run.path, threads=1)
+    other = replace(same, options=CaptureOptions(gps=gps))
+    anew = replace(same, sfm=SfmOptions(max_output_size=200))
+    run.create_or_check(RunSettings.create(run.own_capture, CaptureOptions(), MethodConfig()))
+    write_json(run.capture_file, {})  # as training leaves it
+    before, found = files(run.path), []
+    monkeypatch.setattr(dry_run, "estimate_sfm", lambda plan: found.append("all") or unestimated(plan))
+    monkeypatch.setattr(dry_run, "choose_for_photographs", lambda *_: SimpleNamespace(estimate=1))
+    monkeypatch.setattr(dry_run, "_estimate_from_capture", lambda *_, is_anew: found.append(is_anew))
+    monkeypatch.setattr(dry_run, "_print_estimate", lambda *_: None)
+    for request, left, told in (
+        (same, False, "nothing to do"),
+        (replace(other, overwrite=True), True, "is placed anew, in seconds; its photographs and poses stay; what was"),
+        (replace(anew, overwrite=True), "all", "with other settings (--sfm.*); it is made anew; what was trained"),
+    ):
+        said = console()
+        dry_run.estimate_run(request, said)
+        assert found.pop() == left
+        assert told in said.file.getvalue()
+    for request in (other, anew):
+        with pytest.raises(RunError, match="was made with other positions or other settings"):
+            dry_run.estimate_run(request, console())
+    (card / nine.names[0]).unlink()
+    with pytest.raises(VdgsError, match=rf"1 removed \({nine.names[0]}\)"):
+        dry_run.estimate_run(replace(same, capture=card), console())
+    assert (files(run.path), found) == (before, [])
+
+
 @pytest.fixture(scope="module")
 def marks(nine) -> list[dict[int, np.ndarray]]:
     return sightings(nine.cameras, np.array([[-8.0, -8], [9, -7], [8, 9]]))
@@ -165,6 +224,20 @@ def test_a_known_distance_and_positions_agree_or_are_refused(nine, capture, mark
     assert facts.origin is not None
     with pytest.raises(CaptureError, match=r"3\.[12]\d* times as large.*in feet.*--georeference off"):
         again(nine, capture, scale_bar=bars(tmp_path / "feet.txt", nine, marks, 1 / 0.3048))
+
+
+def test_some_of_many_points_tell_how_far_what_photographs_show_is(nine, capture, marks, tmp_path, monkeypatch):
+    """The limits of a known distance come of it; thousands of photographs times millions of points would last."""
+    model, collection = pycolmap.Reconstruction(capture / MAPPED), collect_images((nine.folder,))
+    distances = scale_bars.read_scale_bars(bars(tmp_path / "bars.txt", nine, marks), collection)
+    all_points = scale_bars.known_scale(model, distances)
+    monkeypatch.setattr(scale_bars, "MAX_POINTS", model.num_points3D())
+    assert scale_bars.known_scale(model, distances) == all_points
+    monkeypatch.setattr(scale_bars, "MAX_POINTS", 50)
+    measured, norm = [], np.linalg.norm
+    monkeypatch.setattr(np.linalg, "norm", lambda array, **how: measured.append(len(array)) or norm(array, **how))
+    assert scale_bars.known_scale(model, distances) == pytest.approx(all_points, rel=0.02)
+    assert max(measured) <= 50 < model.num_points3D()
 
 
 BAD_BARS = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -14,7 +15,7 @@ from rich.console import Console
 
 from support.flights import write_photograph
 from support.known_flight import known_flight
-from vdgs.sfm import incremental_mapper
+from vdgs.sfm import incremental_mapper, reconstruct
 from vdgs.sfm.camera_rigs import describe_rigs, map_rigs
 from vdgs.sfm.feature_extraction import create_database, group_by_camera
 from vdgs.sfm.image_list import collect_images
@@ -130,8 +131,9 @@ def matched(workspace: Workspace, poses: dict[str, np.ndarray], points: np.ndarr
 
 
 def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0, mixed: bool = False):
-    """A flight of two cameras, its photographs, the models without rigs and after `map_rigs`, and what is said. The
-    second camera is off its place on the rig by `shaken_m` (standard deviation), or flies in a `mixed` order."""
+    """A flight of two cameras, the number of its photographs, the models without rigs and after `map_rigs`, and what is
+    said; in the folders photos and work. The second camera is off its place on the rig by `shaken_m` (standard
+    deviation), or flies in a `mixed` order."""
     flight, rng, console = known_flight(strips=2, each=4), np.random.default_rng(0), Console(file=io.StringIO())
     names = [f"cam{s}/{k:04d}.jpg" for s in range(2) for k in range(8)]
     photographs(folder / "photos", names)
@@ -186,3 +188,27 @@ def test_cameras_that_are_not_fixed_to_each_other_are_not_held_together(tmp_path
     assert (model.num_reg_images(), model.num_reg_frames()) == (16, 16)
     assert model.compute_mean_reprojection_error() == loose.compute_mean_reprojection_error()
     assert said in notes
+    assert sensors_of_rigs(Workspace(tmp_path / "work")) == [1, 1]  # nor in what is mapped next
+
+
+def sensors_of_rigs(workspace: Workspace) -> list[int]:
+    """The number of cameras of each rig in the database."""
+    with workspace.open_database() as database:
+        return [rig.num_sensors() for rig in database.read_all_rigs()]
+
+
+def test_models_that_are_made_anew_begin_without_rigs(tmp_path, monkeypatch):
+    """Where another focal length is asked for, or the photographs contradict the one that was held."""
+    mapped(tmp_path)
+    workspace, found = Workspace(tmp_path / "work"), []
+    assert sensors_of_rigs(workspace) == [2]
+
+    def stopped(*_):
+        found.extend(sensors_of_rigs(workspace))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(incremental_mapper, "run_mapper", stopped)
+    plan = SimpleNamespace(image_list=collect_images([tmp_path / "photos"]), threads=1)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct._models(plan, workspace, "another key", 16, False, CONSOLE)
+    assert found == [1, 1]

@@ -177,7 +177,7 @@ def test_tiffs_and_their_masks_are_turned_upright_once(tmp_path, orientation, co
     assert [photo.size for photo in found] == [(160, 120)] * 3
     assert all(np.array_equal(read_keep_mask(photo), left_half()) for photo in found)
     work = Workspace(tmp_path / "work")
-    assert feature_extraction.write_upright_images(work, found) == []
+    assert feature_extraction.write_upright_images(work, found, 2) == []
     pixels = pycolmap.Bitmap.read(work.images / found[0].name, True).to_array()
     assert np.array_equal(pixels, NOISE)
 
@@ -218,7 +218,7 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
     seen = (*seen, replace(collection.images[1], mask=black))
     work, kinds = Workspace(tmp_path / "work"), feature_extraction.group_by_camera(seen)
     feature_extraction.create_database(work, kinds)
-    feature_extraction.write_upright_images(work, seen)
+    feature_extraction.write_upright_images(work, seen, 1)
     write_upright_masks(work, seen, 1)
     options = SfmOptions(max_image_size=240, max_num_features=500)
     counts = feature_extraction.extract_features(work, kinds, options, 1, console())
@@ -254,7 +254,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     write_mask(output / "masks/old.png", left_half())  # of other masks
     reconstruct._write(prepared, work, model, model, "key", console())
     writer, lenses = reconstruct.capture_writer, reconstruct._lenses(model)
-    pinholes = {number: writer.make_undistortion(lens, 200).intrinsics for number, lens in lenses.items()}
+    pinholes = {number: writer.straight_camera(lens, 200) for number, lens in lenses.items()}
     writer.write_model(output, model, pinholes)
     capture = load_capture(output)
     names = {view.name: view.mask_path and view.mask_path.name for view in capture.views}

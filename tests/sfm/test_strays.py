@@ -384,7 +384,7 @@ def test_what_is_done_with_other_kinds_is_said(tmp_path):
     raw = next(each for each in found.images if each.name == "R_0.DNG")
     assert (raw.size, raw.lat_lon, raw.camera) == ((120, 160), pytest.approx((-33.5, -70.6)), "Maker Drone")
     workspace = Workspace(tmp_path.parent / "work")
-    assert not write_upright_images(workspace, found.images)
+    assert not write_upright_images(workspace, found.images, 1)
     shown = decode_image(workspace.images / "R_0.DNG")[0]
     off = np.abs(shown.astype(int) - np.rot90(pixels(0), -1))
     assert off[20:-20, 20:-20].mean() < 12  # the sensor has one color of three at each pixel
@@ -409,7 +409,7 @@ def test_colmap_gets_pixels_of_every_format_that_is_read(tmp_path, orientation):
     assert "WebP; converted to 8-bit sRGB and written as JPEG (a.webp.jpg)" in " ".join(found.notes)
     assert "zstd.tif: TIFF compressed by zstd; converted" in " ".join(found.notes)
     workspace = Workspace(tmp_path / "work")
-    assert not write_upright_images(workspace, found.images)
+    assert not write_upright_images(workspace, found.images, 1)
     for photo in found.images:
         seen = pycolmap.Bitmap.read(str(workspace.images / photo.name), True).to_array()
         shown = apply_orientation(decode_image(photo.path)[0], photo.orientation)
@@ -489,7 +489,7 @@ def test_photographs_without_an_end_go_on_whole(tmp_path, orientation):
     found = collect_images([tmp_path / "card"])
     assert any("lacks its end marker, but nothing of the picture; used" in each for each in said(found))
     work = Workspace(tmp_path / "work")
-    assert write_upright_images(work, found.images) == []
+    assert write_upright_images(work, found.images, 1) == []
     with Image.open(work.images / names[0]) as image:
         image.load()
         assert image.size == ((160, 120) if orientation == 1 else (120, 160))
@@ -507,7 +507,7 @@ def test_a_png_that_is_damaged_is_left_out_before_its_features_are_searched(tmp_
     (tmp_path / "card/1.png").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "card/2.png").write_bytes(whole[: len(whole) // 3] + bytes(8) + whole[len(whole) // 3 + 8 :])
     work = Workspace(tmp_path / "work")
-    failed = write_upright_images(work, collect_images((tmp_path / "card",)).images)
+    failed = write_upright_images(work, collect_images((tmp_path / "card",)).images, 2)
     assert [each.name for each in failed] == ["1.png", "2.png"]
     assert all(each.reason.startswith("cannot be decoded (") for each in failed)
     assert sorted(path.name for path in work.images.iterdir()) == ["0.png", "3.png", "4.png"]

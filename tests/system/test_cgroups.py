@@ -201,8 +201,18 @@ def test_a_job_that_no_group_limits_takes_what_it_asked_for(large, monkeypatch):
 
 
 def test_the_doctor_sees_the_same_limit(large, monkeypatch):
-    monkeypatch.setattr(doctor, "cgroup_limits", lambda: [CgroupLimit(NONE, GB), CgroupLimit(32 * GB, 2 * GB)])
-    (check,) = doctor._memory()
-    assert check.value.startswith("30.0 GB free, limited to 32.0 GB by a control group")
-    monkeypatch.setattr(doctor, "cgroup_limits", list)
-    assert doctor._memory()[0].value == "500.0 GB free of 512.0 GB"
+    def memory_with(groups: list[CgroupLimit]) -> str:
+        for module in (doctor, process_memory):
+            monkeypatch.setattr(module, "cgroup_limits", lambda: groups)
+        (check,) = doctor._memory()
+        return check.value
+
+    limited = [CgroupLimit(NONE, GB), CgroupLimit(32 * GB, 2 * GB)]
+    assert memory_with(limited).startswith("30.0 GB free, limited to 32.0 GB by a control group")
+    assert memory_with([]) == "500.0 GB free of 512.0 GB"
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    monkeypatch.setenv("SLURM_MEM_PER_NODE", str(64 << 10))
+    free, _, why = memory_with([CgroupLimit(NONE, GB)]).partition(" GB free, ")
+    assert 40 < float(free) < 68.7
+    assert why == "limited to 68.7 GB by what the SLURM job asked for"
+    assert memory_with(limited).endswith("(container, SLURM job, systemd unit)")

@@ -67,7 +67,8 @@ def train_momentum_blocks(
                 for plan in able
             ]
             training = _train(joint, able, problems, config, options, console)
-        metadata = ModelMetadata(capture=capture_metadata(capture), version=__version__, key=key, decoder="own")
+        own = capture_metadata(opened.capture)  # with its own masks
+        metadata = ModelMetadata(capture=own, version=__version__, key=key, decoder="own")
         for plan in plans:
             index = plan.index
             of_block = replace(metadata, block=index, views=len(plan.views))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +33,22 @@ def capture_metadata(capture: Capture) -> CaptureMetadata:
 
 
 def capture_fingerprint(capture: Capture) -> dict[str, int]:
-    """CRC-32 of each part of a capture that results depend on. Photographs count by name and size in bytes."""
-    return {
+    """CRC-32 of each part of a capture that results depend on. Photographs and masks count by name and size in bytes:
+    to read thousands of them whenever a run is opened takes too long. Without masks there is no part of theirs."""
+    parts = {
         "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
-        "photographs": _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in capture.views)),
+        "photographs": photographs_crc(capture.views),
         "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
         "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
+    if masks := _masks(capture):
+        parts["masks"] = _crc(*(f"{name}:{mask.stat().st_size}" for name, mask in masks.items()))
+    return parts
+
+
+def photographs_crc(views: Sequence[View]) -> int:
+    """CRC-32 of photographs by their names and sizes in bytes."""
+    return _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in views))
 
 
 def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
@@ -50,13 +59,19 @@ def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any]
             f"{source}: does not say which capture the run belongs to. It is damaged; begin another run: "
             "vdgs run CAPTURE --output RUN"
         )
-    changed = [part for part, crc in capture_fingerprint(capture).items() if known.get(part) != crc]
+    now = capture_fingerprint(capture)
+    changed = [part for part in {**now, **known} if known.get(part) != now.get(part)]
     if changed:
         raise RunError(
             f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "
             "Restore the capture as it was (or the former version of vdgs, where that read the same files otherwise), "
             "or begin another run: vdgs run CAPTURE --output RUN"
         )
+
+
+def _masks(capture: Capture) -> dict[str, Path]:
+    """The masks of photographs, by the names of these."""
+    return {view.name: view.mask_path for view in capture.views if view.mask_path is not None}
 
 
 def _camera_bytes(view: View) -> bytes:

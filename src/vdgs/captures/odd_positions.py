@@ -10,6 +10,8 @@ from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 NULL_POSITION_DEG = 0.01
 #: A position so many times farther from the middle than the median one, and so many metres, is another flight's.
 OUTLIER_FACTOR, OUTLIER_DISTANCE_M = 10.0, 1000.0
+#: So many positions beside each other out there are a part of the capture all the same: a road, another site (choice).
+LEAST_GROUP = 10
 #: Positions that spread less than this (metres) say nothing: the receiver kept the first, or nobody moved.
 MIN_SPREAD_M = 2.0
 
@@ -21,7 +23,8 @@ def are_nowhere(geodetic: np.ndarray) -> np.ndarray:
 
 
 def are_far_off(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Which positions [n, 3] (degrees, metres) cannot be of the flight of the `known` ones [n] bool, [n] bool."""
+    """Which positions [n, 3] (degrees, metres) cannot be of the flight of the `known` ones [n] bool, [n] bool: far from
+    most, and few or all at one place there."""
     level = geodetic.copy()
     heights = geodetic[known & np.isfinite(geodetic[:, 2]), 2]
     level[:, 2] = np.where(np.isfinite(geodetic[:, 2]), geodetic[:, 2], np.median(heights) if len(heights) else 0.0)
@@ -30,9 +33,27 @@ def are_far_off(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
     across = np.linalg.norm(enu[:, :2], axis=1)
     up = np.abs(level[:, 2] - np.median(altitudes))
     with np.errstate(invalid="ignore"):
-        return (across > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(across[known])))) | (
-            up > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(up[known])))
-        )
+        far = known & (across > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(across[known]))))
+        high = up > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(up[known])))
+    if far.any():
+        groups = _groups(enu[known, :2])
+        far[known] &= [not _is_flown(enu[known, :2][groups == group]) for group in groups]
+    return far | high
+
+
+def _is_flown(places: np.ndarray) -> bool:
+    return len(places) >= LEAST_GROUP and bool(np.ptp(places, axis=0).max() >= MIN_SPREAD_M)
+
+
+def _groups(places: np.ndarray) -> np.ndarray:
+    """A number for each place [n, 2] of those that lie in squares beside each other, as wide as strays are far."""
+    from scipy.sparse.csgraph import connected_components  # slow to load, and few captures have strays
+    from scipy.spatial import cKDTree
+
+    squares, number = np.unique(np.floor(places / OUTLIER_DISTANCE_M), axis=0, return_inverse=True)
+    tree = cKDTree(squares)
+    beside = tree.sparse_distance_matrix(tree, 1.0, p=np.inf)
+    return np.asarray(connected_components(beside)[1][number.ravel()])
 
 
 def do_not_spread(enu: np.ndarray) -> bool:

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import stdtrit
+from scipy.special import chdtri, fdtri, stdtrit
 
 from vdgs.captures.gps_altitudes import are_over_ground
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M, fit_plane, in_plane
@@ -119,6 +120,22 @@ class Problem:
     """Standard deviations [n, 3] that the receiver itself states."""
     has_altitudes: bool = True
     """Whether the targets have heights; where not, heights are ignored and the fit is one in the plane."""
+    flights: np.ndarray | None = None
+    """Which positions are of one receiver and flight [n] int: drones that fly at the same time err on their own."""
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """The positions as receivers recorded them [n] int, one flight after the other."""
+        if self.flights is None:
+            return np.argsort(self.times, kind="stable")
+        _, flight = np.unique(self.flights, return_inverse=True)
+        begins = np.full(flight.max(initial=0) + 1, np.inf)
+        np.minimum.at(begins, flight, self.times)
+        return np.lexsort((self.times, begins[flight]))
+
+    def in_order(self, inliers: np.ndarray) -> np.ndarray:
+        """The same of the positions that are trusted [n] bool, numbered among themselves."""
+        return (np.cumsum(inliers) - 1)[self.order[inliers[self.order]]]
 
 
 def fit_positions(problem: Problem) -> PositionFit:
@@ -156,7 +173,7 @@ def _says_less_than_views(fit: PositionFit, problem: Problem) -> bool:
     """Whether altitudes tell up less well than it is known without positions."""
     places = fit.placed[fit.inliers, :2]
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1]
-    alike = _alike(fit.residuals[fit.inliers], problem.times[fit.inliers])[2]
+    alike = _alike(fit.residuals[fit.inliers], problem.in_order(fit.inliers))[2]
     tilt = np.degrees(np.arctan2(fit.gps_std[2] * alike, max(float(spread), 1e-9)))
     return bool(tilt > problem.up.deviation_deg and fit.gps_std[2] > 2 * fit.gps_std[:2].max())
 
@@ -192,9 +209,9 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
     free = [_settle(problem, start, "unused") for start in _tilted_starts(problem, held.inliers)]
     best, other = sorted(free, key=lambda fit: fit.score)
     known_deg = BOTH_WITHIN * up.deviation_deg
-    if _explains_more(best, held, problem.times):
+    if _explains_more(best, held, problem):
         apart_deg = _tilt_deg(other, best.similarity.rotation[2])
-        if apart_deg <= known_deg or _explains_more(best, other, problem.times):
+        if apart_deg <= known_deg or _explains_more(best, other, problem):
             return replace(best, level_error_deg=max(best.level_error_deg, known_deg))
         known_deg = max(known_deg, _tilt_deg(best, up.direction))  # it is tilted, to whichever side
     scale, north_deg = _moved_by_tilts(held, known_deg)
@@ -210,11 +227,11 @@ def _tilt_deg(fit: PositionFit, up: np.ndarray) -> float:
     return float(np.degrees(np.linalg.norm(_tilt(fit.similarity.rotation @ up))))
 
 
-def _explains_more(one: PositionFit, other: PositionFit, times: np.ndarray) -> bool:
+def _explains_more(one: PositionFit, other: PositionFit, problem: Problem) -> bool:
     """Whether a fit plainly explains positions across better than another: residuals that follow each other alike count
     as if there were fewer of them. Altitudes, which neither uses, are left out."""
-    alike = float(_alike(one.residuals[one.inliers], times[one.inliers])[:2].max())
-    up = len(times) * float(np.log(other.gps_std[2] / one.gps_std[2]))
+    alike = float(_alike(one.residuals[one.inliers], problem.in_order(one.inliers))[:2].max())
+    up = len(one.inliers) * float(np.log(other.gps_std[2] / one.gps_std[2]))
     return other.score - one.score - up > TILT_COSTS * alike**2
 
 
@@ -273,20 +290,19 @@ def _settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
         residuals = _residuals(problem, state, middle, times)
         inliers = _trusted(residuals, _deviations(residuals[inliers], model, problem.stated, True), model)
         gps_std = _deviations(residuals[inliers], model, problem.stated)
-        alike = _alike(residuals[inliers], problem.times[inliers])
+        alike = _alike(residuals[inliers], problem.in_order(inliers))
         state, normal, gains = _step(problem, state, middle, times, inliers, gps_std * alike, model)
     residuals = _residuals(problem, state, middle, times)
     gps_std = _deviations(residuals[inliers], model, problem.stated)
     translation = state.middle - state.scale * state.rotation @ middle
     similarity = Similarity(state.scale, state.rotation, translation)
     placed = similarity.apply(problem.centers)
-    wandering = _wandering(residuals[inliers], problem.times[inliers], gains)
+    order = problem.in_order(inliers)
+    wandering = _wandering(residuals[inliers], order, gains)
     scale, north, level, place = _errors(
         normal, wandering, int(inliers.sum()), gps_std, state.drift, model, problem.stated
     )
-    level = _with_unseen_step(
-        level, problem, state, gains[:, np.argsort(problem.times[inliers], kind="stable")], gps_std
-    )
+    level = _with_unseen_step(level, problem, state, gains[:, order], gps_std)
     return PositionFit(
         similarity=similarity, inliers=inliers, residuals=placed - problem.targets, placed=placed,
         gps_std=gps_std, altitude=model if problem.has_altitudes else "none",
@@ -344,12 +360,12 @@ def _trusted(residuals: np.ndarray, gps_std: np.ndarray, model: str) -> np.ndarr
     return trusted if trusted.sum() >= max(3, len(residuals) / 2) else np.ones(len(residuals), bool)
 
 
-def _alike(residuals: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """By how much more residuals that follow each other alike leave open than as many independent ones, [3]."""
+def _alike(residuals: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """By how much more residuals that follow each other, in this order, alike leave open than as many independent ones,
+    [3]."""
     if len(residuals) < 2 * ENOUGH_TO_DOUBT:
         return np.ones(3)
-    ordered = residuals[np.argsort(times, kind="stable")]
-    ordered = ordered - ordered.mean(axis=0)
+    ordered = residuals[order] - residuals.mean(axis=0)
     power = np.maximum((ordered**2).sum(axis=0), 1e-12)
     alike = np.clip((ordered[1:] * ordered[:-1]).sum(axis=0) / power, 0.0, MOST_ALIKE)
     return np.sqrt((1 + alike) / (1 - alike))
@@ -417,10 +433,10 @@ def _tilt(up: np.ndarray) -> np.ndarray:
     return up[:2] * (angle / across if across > 1e-12 else 1.0)
 
 
-def _wandering(residuals: np.ndarray, times: np.ndarray, gains: np.ndarray) -> np.ndarray:
+def _wandering(residuals: np.ndarray, order: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """Variances [8] that come of positions which wander, as those of receivers do: a walk of random steps, as large as
-    residuals differ more between photographs that are farther apart in time."""
-    count, order = len(residuals), np.argsort(times, kind="stable")
+    residuals differ more between photographs that are farther apart in their order."""
+    count = len(residuals)
     if count < ENOUGH_TO_WANDER:
         return np.zeros(8)
     apart, ordered = max(2, count // 8), residuals[order]
@@ -450,17 +466,29 @@ def _errors(
     )
     if open_:
         errors[:4] = np.where(errors[:4] > 0, errors[:4], math.pi)
-    common = gps_std
+    common, is_found = gps_std, True
     if stated is not None:
         said = np.median(stated, axis=0)
-        common = np.where(gps_std > BELIEVED * said, gps_std, said)
-    across = math.hypot(float(np.hypot(*errors[4:6])), 2 * float(np.sqrt((common[:2] ** 2).mean())))
-    mean_up = 2 * float(gps_std[2]) / math.sqrt(count) if model == "unused" else float(errors[6])
+        common, is_found = np.where(gps_std > BELIEVED * said, gps_std, said), bool((gps_std > BELIEVED * said).any())
+    usual = 2 if count < ENOUGH_TO_DOUBT else 0  # what positions usually are counts, too
+    free = np.array([2 * count - 4, count - {"used": 3, "drifts": 4, "unused": 1}[model]]) + usual
+    free = np.maximum(free, 1) if is_found else np.full(2, np.inf)
+    across = radius_95(np.maximum(np.diag(covariance)[4:6], 0.0) + wandering[4:6] + common[:2] ** 2, free[0])
+    times = radius_95(np.ones(1), free[1])
+    mean_up = times * float(gps_std[2]) / math.sqrt(count) if model == "unused" else float(errors[6])
     # What is level decides how much of the altitudes is drift: at most half of it again may be tilt.
     drift_error = min(float(errors[7]), abs(drift) / 2) if model == "drifts" else 0.0
-    up = math.hypot(mean_up, 2 * float(common[2]) + (abs(drift) + drift_error) / 2)
+    up = math.hypot(mean_up, times * float(common[2]) + (abs(drift) + drift_error) / 2)
     level = float(np.degrees(np.hypot(*errors[1:3])))
     return float(math.expm1(min(50.0, errors[0]))), float(np.degrees(errors[3])), level, (across, up)
+
+
+def radius_95(variances: np.ndarray, free: float) -> float:
+    """The distance that 95 % stay below, of errors along one axis or two with these variances, which were found with so
+    many degrees of freedom: Student's t for one, of two as many axes as they are worth (Satterthwaite)."""
+    axes = float(variances.sum() ** 2 / (variances**2).sum())
+    times = fdtri(axes, free, 0.95) if math.isfinite(free) else chdtri(axes, 0.05) / axes
+    return math.sqrt(float(variances.sum()) * float(times))
 
 
 def _with_unseen_step(

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from vdgs.config.options import Option, Values, options_of, with_values
+from vdgs.config.options import Option, Values, option_words, options_of, with_values
 from vdgs.config.output_paths import is_output
 from vdgs.config.ranges import check_ranges
 from vdgs.errors import RunError, VdgsError
@@ -88,8 +88,8 @@ class GivenArguments:
         if option.is_positional:
             return words
         if option.is_repeatable:
-            return [word for each in words for word in (option.flag, each)]
-        return [option.off_flag if value is False else option.flag, *words]
+            return [word for each in words for word in option_words(option.flag, [each])]
+        return option_words(option.off_flag if value is False else option.flag, words)
 
 
 def _paths(value: Any) -> list[Path]:

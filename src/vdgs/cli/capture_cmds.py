@@ -112,7 +112,7 @@ def sfm_command(arguments: list[str]) -> None:
     args = parse_arguments(SfmArguments, arguments, "sfm")
     from vdgs.captures.format_dispatch import lacks_points
     from vdgs.captures.output_guard import is_capture
-    from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
+    from vdgs.sfm.reconstruction_plan import print_plan
 
     request = SfmRequest(
         image_folders=args.images, output=args.output, gps=args.gps, threads=args.threads,
@@ -134,11 +134,14 @@ def sfm_command(arguments: list[str]) -> None:
         return
     if args.dry_run:
         from vdgs.sfm.films.take_frames import temporary_frames
+        from vdgs.sfm.reconstruct import describe_work_left, look_at_work
         from vdgs.sfm.sfm_estimate import estimate_sfm
 
         with temporary_frames(request, console) as with_frames:
-            plan = plan_reconstruction(with_frames)
-            print_plan(plan, estimate_sfm(plan).text(plan.threads), console)
+            plan, left = look_at_work(with_frames, None)
+            if said := describe_work_left(request, left):
+                console.print(escape(said), highlight=False)
+            print_plan(plan, estimate_sfm(plan).text(plan.threads) if left == "all" else "", console)
         console.print("Nothing was written.", highlight=False)
         return
     if is_posed:

@@ -150,7 +150,7 @@ def ortho_command(arguments: list[str]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewArguments(ViewRequest):
+class ViewArguments(ViewRequest, CaptureArguments):
     """Show a run in a browser: move through the true model, drawn on this machine; its layers (depth, V, alpha, blocks,
     errors), what is known of a clicked place, camera paths for `vdgs render --path`. Follows a run that still trains.
 
@@ -164,6 +164,11 @@ class ViewArguments(ViewRequest):
 
 def view_command(arguments: list[str]) -> None:
     args = parse_arguments(ViewArguments, arguments, "view")
+    if args.capture is not None:
+        from vdgs.runs.open_run import relocate_capture
+        from vdgs.runs.run_folder import RunFolder
+
+        relocate_capture(RunFolder(args.run), args.capture)
     if args.static is not None:
         write_static_viewer(args, args.static)
         return

@@ -28,6 +28,9 @@ from vdgs.system.quoting import shell_word
 #: Options that the command in config.yaml leaves out: they belong to one start.
 NOT_KEPT = ("--overwrite", "--quiet")
 
+#: The sections of settings of what comes after the coarse stage.
+LATER_SECTIONS = ("partition", "assignment", "block", "merge")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ConfigFileArguments:
@@ -70,7 +73,8 @@ def train_coarse_command(arguments: list[str]) -> None:
     device = set_up_compute(args.device, args.threads)
     from vdgs.pipeline.image_size import choose_image_size
     from vdgs.pipeline.train_coarse import train_coarse
-    from vdgs.runs.create_or_resume import create_or_resume_run
+    from vdgs.runs.config_file import changed_flags
+    from vdgs.runs.create_or_resume import create_or_resume_run, run_settings
     from vdgs.runs.run_folder import RunFolder
 
     RunFolder(args.output).check_output_empty()
@@ -82,6 +86,13 @@ def train_coarse_command(arguments: list[str]) -> None:
     context = create_or_resume_run(
         args.capture, args.output, choice.request.options, method, command=command, capture=choice.capture
     )
+    asked = run_settings(args.capture, choice.request.options, method)
+    if ignored := changed_flags(context.run.settings(), asked, LATER_SECTIONS):
+        console.print(
+            f"[yellow]note[/] the run keeps its settings of later stages ({', '.join(ignored)}): `vdgs run` changes "
+            "them, or the stage that they are of (partition, train-blocks, merge)",
+            highlight=False,
+        )
     train_coarse(context, args.checkpointing, console, device)
 
 

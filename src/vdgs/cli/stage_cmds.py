@@ -41,7 +41,10 @@ def visibility_command(arguments: list[str]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class PartitionArguments(ShardArguments, ComputeOptions, StageArguments):
-    """Cut a run's scene into blocks by place and visibility, and give each block its cameras."""
+    """Cut a run's scene into blocks by place and visibility, and give each block its cameras.
+
+    Before, what `vdgs visibility` finds is found where that was not run.
+    """
 
     overwrite: bool = False
     """Allow another cut to discard blocks that are trained."""
@@ -56,13 +59,18 @@ def partition_command(arguments: list[str]) -> None:
         PartitionArguments, arguments, "partition",
         lambda own: {"partition": own.partition, "assignment": own.assignment},
     )  # fmt: skip
-    from vdgs.pipeline.partition_stage import explain_view, partition_run
+    from vdgs.pipeline.count_visibility import count_run_visibility
+    from vdgs.pipeline.find_motion import find_run_motion
+    from vdgs.pipeline.partition_stage import explain_view, is_cut, partition_run
     from vdgs.runs.run_context import RunContext
 
     device, console = set_up_compute(args.device, args.threads), make_console(args.quiet)
     execution, context = args.execution(device), RunContext.from_path(args.run, args.capture)
     method = replace(method, partition=args.partition, assignment=args.assignment)
     update_run_settings(run, method, args.overwrite, console)
+    if not is_cut(run):  # a look at the cut of a trained run changes nothing
+        find_run_motion(context, console, device)
+        count_run_visibility(context, console)
     partition_run(context, console, device, execution)
     if args.explain is not None:
         explain_view(run, args.explain, console)

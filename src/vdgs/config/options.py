@@ -109,6 +109,11 @@ class Option:
             raise ValueError(f"{said}: must be {kind}{how}" if said else f"needs a value: {kind}") from None
 
 
+def option_words(flag: str, words: Sequence[str]) -> list[str]:
+    """An option and its values as a command line has them: a value that looks like an option is joined to it."""
+    return [f"{flag}={words[0]}"] if len(words) == 1 and words[0].startswith("-") else [flag, *words]
+
+
 def off_flag(flag: str) -> str:
     """The name that switches an option off."""
     *groups, last = flag.removeprefix("--").split(".")

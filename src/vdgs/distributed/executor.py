@@ -166,6 +166,8 @@ class AttemptResult:
     """The system, or the cluster, ended it for want of memory."""
     out_of_time: bool = False
     """It was asked to save because its time was up or its place was needed, and did."""
+    node_rejected: bool = False
+    """It met a node that cannot work on the run, of which nobody knew; the next attempt avoids it."""
 
 
 class Attempt(Protocol):

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vdgs.errors import RunError
-from vdgs.system.file_locks import is_locked
+from vdgs.system.file_locks import LOCK_FILE, is_locked
 
 #: The name of the folder of all jobs in the folder that they are for.
 SHARDS = "shards"
@@ -36,10 +36,29 @@ def clear(output: Path, key: str | None = None) -> None:
 
 
 def remove(job: Path) -> None:
-    """Remove the folder of a job, and that of all jobs once nothing is in it."""
-    shutil.rmtree(job)
+    """Remove the folder of a job that no process of this machine holds, and that of all jobs once nothing is in it.
+
+    What cannot be removed stays for the next `clear`: the work that lay there is done.
+    """
     with suppress(OSError):
-        job.parent.rmdir()
+        empty(job)
+        if not any(each.name != LOCK_FILE for each in job.iterdir()):  # else the lock says that it is a job's
+            (job / LOCK_FILE).unlink(missing_ok=True)
+            job.rmdir()
+            job.parent.rmdir()
+
+
+def empty(job: Path) -> None:
+    """Remove what is in the folder of a job but its lock: NFS keeps a file that is open, in a folder which then cannot
+    be removed either."""
+    for each in job.iterdir():
+        if each.name == LOCK_FILE:
+            continue
+        if each.is_dir() and not each.is_symlink():
+            shutil.rmtree(each, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                each.unlink()
 
 
 def _is_job(folder: Path) -> bool:
@@ -47,5 +66,5 @@ def _is_job(folder: Path) -> bool:
     locked once. An empty one was made by a driver that ended at once, or is no loss."""
     if folder.is_symlink() or not folder.is_dir() or not _KEY.fullmatch(folder.name):
         return False
-    locked = (folder / ".lock").exists() or any(folder.glob("*/.lock"))
+    locked = (folder / LOCK_FILE).exists() or any(folder.glob(f"*/{LOCK_FILE}"))
     return locked or not any(folder.iterdir())

@@ -242,7 +242,7 @@ class _RayEngine:
             name=self._actor_name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0,
             max_concurrency=8, **options,
         )  # fmt: skip
-        return _RayAttempt(actor.remote(spec), self)
+        return _RayAttempt(actor.remote(spec), self, frozenset(self.rejected_nodes))
 
     def find_running(self, task: Task) -> Attempt | None:
         import ray
@@ -262,8 +262,8 @@ class _RayEngine:
 
 
 class _RayAttempt:
-    def __init__(self, actor: Any, engine: _RayEngine):
-        self._actor, self._engine = actor, engine
+    def __init__(self, actor: Any, engine: _RayEngine, avoided: frozenset[str] = frozenset()):
+        self._actor, self._engine, self._avoided = actor, engine, avoided
         self._begin = actor.begin.remote()
         self._end: Any = None
         self._result: AttemptResult | None = None
@@ -303,7 +303,8 @@ class _RayAttempt:
     def _started(self, answer: AttemptStarted | NodeRejected) -> None:
         if isinstance(answer, NodeRejected):
             self._engine.rejected_nodes.add(answer.node_id)
-            self._result = AttemptResult(None, f"a node that cannot work on the run, {answer.node}: {answer.reason}")
+            reason = f"a node that cannot work on the run, {answer.node}: {answer.reason}"
+            self._result = AttemptResult(None, reason, node_rejected=answer.node_id not in self._avoided)
             return
         self.start_info, self._end = answer, self._actor.end.remote()
 

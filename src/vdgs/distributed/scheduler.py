@@ -231,6 +231,10 @@ class _TaskScheduler:
         elif self._stopping:
             reason = f"ended by {_end_text(end)}; continues from its last checkpoint"
             self._end(state, "stopped", reason, was_killed=True)
+        elif end.node_rejected:  # no attempt of its own; as many as there are nodes
+            state.attempts -= 1
+            self._listener.on_crashed(state.task, _end_text(end), self._policy.retries + 1 - state.attempts)
+            self._waiting.append(state)
         else:
             self._crashed(state, end, why)
 

@@ -27,7 +27,7 @@ from vdgs.config.executor_options import ExecutorOptions
 from vdgs.config.serialization import to_dict
 from vdgs.distributed.backend_selection import select_backend
 from vdgs.distributed.executor import TaskResult
-from vdgs.distributed.job_folders import SHARDS, clear, remove
+from vdgs.distributed.job_folders import SHARDS, clear, empty, remove
 from vdgs.distributed.job_labels import JobLabels
 from vdgs.distributed.node_check import NodeRequirements, code_digest
 from vdgs.distributed.resource_allocation import Allocation, MachineResources, ShardWorkload
@@ -152,7 +152,8 @@ class ShardedJob:
         clear(self.output, self.key)
         with lock_folder(self.folder):
             yield
-            remove(self.folder)
+            empty(self.folder)
+        remove(self.folder)  # once its lock is closed
 
     def run(self, needs: ShardNeeds, execution: ExecutionOptions, console: Console) -> None:
         """Do the shards that are left. Raises what `send` raises."""

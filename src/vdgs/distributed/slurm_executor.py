@@ -11,7 +11,7 @@ import secrets
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from vdgs.system.quoting import sbatch_directive, shell_line, slurm_file_pattern
 #: How often a job that squeue no longer lists is looked for in vain before it counts as lost: shared file systems show
 #: a file some seconds after it was written.
 MAX_MISSED_POLLS = 6
-#: How often in a row SLURM may give no answer: a controller is started again in some minutes.
+#: How often in a row SLURM may give no answer, or take no further jobs: a controller is started again in some minutes.
 MAX_FAILED_POLLS = 60
 #: SLURM's states of ended jobs, in words.
 END_REASONS = {
@@ -48,6 +48,9 @@ END_REASONS = {
     "TIMEOUT": "its time limit, before it saved", "OUT_OF_MEMORY": "SLURM, for want of memory",
     "DEADLINE": "its deadline",
 }  # fmt: skip
+
+#: The option of sbatch that names nodes to avoid.
+EXCLUDE = "--exclude="
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +69,19 @@ class SlurmExecutor(ExecutionPolicy):
         return run_tasks(tasks, _SlurmEngine(self.requirements, self.options, self.max_concurrent), policy, listener)
 
 
+@dataclass
+class _Submission:
+    """An array of jobs, and how often SLURM did not take it."""
+
+    folder: Path
+    attempts: list[_SlurmAttempt]
+    failures: int = 0
+
+    @property
+    def script(self) -> Path:
+        return self.folder / "job.sh"
+
+
 class _SlurmEngine:
     #: Nobody knows what the nodes have; SLURM refuses requests that are too large.
     max_memory_bytes = sys.maxsize
@@ -75,6 +91,10 @@ class _SlurmEngine:
         self._folder = requirements.folder / "slurm"
         self._prefix = f"vdgs-{hashlib.sha256(str(requirements.folder).encode()).hexdigest()[:10]}-"
         self._failed_polls = 0
+        #: Nodes that cannot work on the run; what SLURM did not take yet.
+        self.rejected_nodes = set[str]()
+        self._refused = list[_Submission]()
+        self._has_submitted = False
         #: The jobs that squeue lists, by their numbers; those that an earlier driver submitted.
         self.queue = self._list_queue()
         self._earlier = dict(self.queue)
@@ -104,6 +124,9 @@ class _SlurmEngine:
             self._failed_polls += 1
             if self._failed_polls > MAX_FAILED_POLLS:
                 raise
+            return
+        for submission in list(self._refused):
+            self._submit_again(submission)
 
     def _list_queue(self) -> dict[ArrayTaskId, QueueEntry]:
         return {entry.task_id: entry for entry in slurm_commands.list_queue(self._prefix)}
@@ -116,7 +139,8 @@ class _SlurmEngine:
     def _submit(self, resources: TaskResources, group: Sequence[tuple[Task, int]]) -> dict[str, Attempt | OSError]:
         name = f"{self._prefix}{time.strftime('%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         folder = self._folder / name
-        script = make_batch_script(folder, len(group), resources, self._options, self._at_once)
+        avoided = frozenset(self.rejected_nodes)
+        script = make_batch_script(folder, len(group), resources, self._options, self._at_once, avoided)
         try:
             folder.mkdir(parents=True)
             tasks = {str(index): _task_json(task, attempt) for index, (task, attempt) in enumerate(group)}
@@ -124,20 +148,51 @@ class _SlurmEngine:
             write_text(folder / "job.sh", script)
         except OSError as error:
             return {task.name: error for task, _ in group}
+        attempts = [_SlurmAttempt(ArrayTaskId("", index), folder, self, avoided) for index in range(len(group))]
+        submission = _Submission(folder, attempts)
         try:
-            number = slurm_commands.submit(folder / "job.sh")
+            self._list(submission, slurm_commands.submit(submission.script))
         except SlurmError as error:
-            raise VdgsError(f"SLURM does not take the jobs: {error}\nThe script: {folder / 'job.sh'}") from error
-        attempts = dict[str, Attempt | OSError]()
-        for index, (task, _) in enumerate(group):
-            task_id = ArrayTaskId(number, index)
-            self.queue[task_id] = QueueEntry(task_id, "PENDING", name, "")  # until squeue says otherwise
-            attempts[task.name] = _SlurmAttempt(task_id, folder, self)
-        return attempts
+            if not (self._has_submitted or self.queue):
+                raise VdgsError(f"SLURM does not take the jobs: {error}\nThe script: {submission.script}") from error
+            self._refused.append(submission)  # others are at work, and SLURM may be busy
+        return {task.name: attempt for (task, _), attempt in zip(group, attempts, strict=True)}
+
+    def _submit_again(self, submission: _Submission) -> None:
+        """Submit what SLURM did not take, unless it did: a busy controller may take a job and answer too late."""
+        self._refused.remove(submission)
+        if all(attempt.has_ended for attempt in submission.attempts):
+            return
+        name = submission.folder.name
+        taken = next((task_id.array for task_id, entry in self.queue.items() if entry.name == name), "")
+        try:
+            self._list(submission, taken or slurm_commands.submit(submission.script))
+        except SlurmError as error:
+            submission.failures += 1
+            if submission.failures < MAX_FAILED_POLLS:
+                self._refused.append(submission)
+                return
+            for attempt in submission.attempts:
+                attempt.give_up(f"SLURM, which does not take it ({error}; the script: {submission.script})")
+
+    def _list(self, submission: _Submission, number: str) -> None:
+        """Take the jobs of a submission for queued until squeue says otherwise."""
+        self._has_submitted = True
+        for attempt in submission.attempts:
+            attempt.task_id = ArrayTaskId(number, attempt.task_id.index)
+            queued = QueueEntry(attempt.task_id, "PENDING", submission.folder.name, "")
+            self.queue.setdefault(attempt.task_id, queued)
 
 
-def make_batch_script(folder: Path, count: int, resources: TaskResources, options: SlurmOptions, at_once: int) -> str:
-    """The script for sbatch: an array of `count` jobs, `at_once` of them at a time."""
+def make_batch_script(
+    folder: Path,
+    count: int,
+    resources: TaskResources,
+    options: SlurmOptions,
+    at_once: int,
+    avoided: Collection[str] = (),
+) -> str:
+    """The script for sbatch: an array of `count` jobs, `at_once` of them at a time, on no node that is `avoided`."""
     directives = {
         "job-name": folder.name,
         "array": f"0-{count - 1}" + (f"%{at_once}" if at_once < count else ""),
@@ -154,23 +209,35 @@ def make_batch_script(folder: Path, count: int, resources: TaskResources, option
         "output": slurm_file_pattern(folder, "%a.out"),
     }
     words = [f"--{name}={value}" for name, value in directives.items() if value]
-    lines = [sbatch_directive(word) for word in (*words, "--requeue", *options.sbatch_args)]
+    asked = [word.removeprefix(EXCLUDE) for word in options.sbatch_args if word.startswith(EXCLUDE)]
+    exclude = [EXCLUDE + ",".join([*asked, *sorted(avoided)])] if avoided else []  # SLURM takes the last one
+    lines = [sbatch_directive(word) for word in (*words, "--requeue", *options.sbatch_args, *exclude)]
     job = shell_line(python_command("vdgs.distributed.slurm_job", folder))
     setup = [options.setup_command] if options.setup_command else []
     return "\n".join(["#!/bin/bash", *lines, "", *setup, f"exec {job}", ""])
 
 
 class _SlurmAttempt:
-    def __init__(self, task_id: ArrayTaskId, folder: Path, engine: _SlurmEngine):
-        self._task_id, self._folder, self._engine = task_id, folder, engine
+    """A job of an array; the number of its array is empty until SLURM takes it."""
+
+    def __init__(self, task_id: ArrayTaskId, folder: Path, engine: _SlurmEngine, avoided: frozenset[str] = frozenset()):
+        self.task_id, self._folder, self._engine, self._avoided = task_id, folder, engine, avoided
         self._result: AttemptResult | None = None
         self._missed_polls = self._turn = 0
         self._is_cancelled = self._is_killed = False
         self.start_info: AttemptStarted | None = None
 
+    @property
+    def has_ended(self) -> bool:
+        return self._result is not None
+
+    def give_up(self, why: str) -> None:
+        """It is lost before it began."""
+        self._result = self._result or AttemptResult(None, why)
+
     def poll(self) -> AttemptResult | None:
-        if self._result is None and self._engine.is_current:
-            entry, record = self._engine.queue.get(self._task_id), read_task_record(self._folder, self._task_id.index)
+        if self._result is None and self.task_id.array and self._engine.is_current:
+            entry, record = self._engine.queue.get(self.task_id), read_task_record(self._folder, self.task_id.index)
             if entry is not None:
                 self._missed_polls = 0
                 self._follow(entry, record)
@@ -187,16 +254,18 @@ class _SlurmAttempt:
             self.start_info = None if is_new_turn else AttemptStarted(record.output_from, record.node)
 
     def request_stop(self) -> None:
-        if self.start_info is None:
+        if not self.task_id.array:
+            self._result = AttemptResult(EXIT_STOPPED)
+        elif self.start_info is None:
             self._is_cancelled = True
-            slurm_commands.cancel(self._task_id)
+            slurm_commands.cancel(self.task_id)
         else:
-            slurm_commands.signal_batch(self._task_id, "TERM")
+            slurm_commands.signal_batch(self.task_id, "TERM")
 
     def kill(self) -> None:
         if not self._is_killed:
             self._is_killed = True
-            slurm_commands.cancel(self._task_id)
+            slurm_commands.cancel(self.task_id)
 
     def _ended(self, record: SlurmTaskRecord | None) -> AttemptResult | None:
         """How it ended; None while that may still become known."""
@@ -206,14 +275,18 @@ class _SlurmAttempt:
             self._missed_polls += 1
             return self._lost(record) if self._missed_polls > MAX_MISSED_POLLS else None
         if record.unfit:
-            return AttemptResult(None, f"a node that cannot work on the run, {record.node}: {record.unfit}")
+            self._engine.rejected_nodes.add(record.node)
+            reason = f"a node that cannot work on the run, {record.node}: {record.unfit}"
+            return AttemptResult(None, reason, node_rejected=record.node not in self._avoided)
         if self.start_info is None:
             self.start_info = AttemptStarted(record.output_from, record.node)
-        is_preempted = record.code == EXIT_STOPPED and not record.out_of_time and self._job().state == "PREEMPTED"
-        return AttemptResult(record.code, "", record.out_of_memory, record.out_of_time or is_preempted)
+        # One that put itself back into the queue may be cancelled there.
+        state = self._job().state if record.code == EXIT_STOPPED else ""
+        lost_its_place = state == "PREEMPTED" or (record.out_of_time and state != "CANCELLED")
+        return AttemptResult(record.code, "", record.out_of_memory, lost_its_place)
 
     def _job(self) -> JobState:
-        return slurm_commands.query_job_state(self._task_id) or JobState("")
+        return slurm_commands.query_job_state(self.task_id) or JobState("")
 
     def _lost(self, record: SlurmTaskRecord | None) -> AttemptResult:
         """Its script was ended before it could write how."""
@@ -223,7 +296,7 @@ class _SlurmAttempt:
         node = record.node if record is not None else job.node
         where = f" {node}" if node else ""
         if record is None and job.state in ("", "FAILED"):
-            hint = f"see that it sees {self._folder} (what it printed: {self._folder / f'{self._task_id.index}.out'})"
+            hint = f"see that it sees {self._folder} (what it printed: {self._folder / f'{self.task_id.index}.out'})"
             return AttemptResult(None, f"an error on its node{where} before its first line; {hint}")
         how = END_REASONS.get(job.state, f"SLURM ({job.state})" if job.state else "SLURM, without a word")
         return AttemptResult(None, f"{how}{where}", job.state == "OUT_OF_MEMORY")

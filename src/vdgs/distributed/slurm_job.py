@@ -61,7 +61,8 @@ def main(arguments: list[str]) -> int:
     content = read_json(folder / "tasks.json")
     task, before = content["tasks"][str(task_id.index)], read_task_record(folder, task_id.index)
     answer = check_node(content["question"])
-    record = SlurmTaskRecord(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn)
+    node = variables.get("SLURMD_NODENAME") or socket.gethostname()  # as SLURM calls it
+    record = SlurmTaskRecord(node=node, output_from=_size(task["output"]), turn=turn)
     update = _record_updater(folder / f"{task_id.index}.json", record)
     if answer["problems"]:
         update(code=EXIT_EXPLAINED[0], unfit=answer["problems"][0])

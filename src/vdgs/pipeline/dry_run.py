@@ -14,7 +14,6 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, resolve_iterations
 from vdgs.config.ranges import check_ranges
@@ -27,8 +26,8 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, get_run_status
 from vdgs.sfm.films.take_frames import temporary_frames
 from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
-from vdgs.sfm.reconstruct import check_nothing_trained
-from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
+from vdgs.sfm.reconstruct import describe_work_left, look_at_work
+from vdgs.sfm.reconstruction_plan import print_plan
 from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request, size_apart
 from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
@@ -49,13 +48,19 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
     posed, size = size_apart(request)
     if lacks_points(posed.capture, posed.options):
         return _estimate_from_poses(posed, size, console)
+    return _estimate_from_capture(request, console)
+
+
+def _estimate_from_capture(request: RunRequest, console: Console, is_anew: bool = False) -> RunEstimate:
+    """What remains of a run of a capture; the whole run where it is to be trained anew."""
     choice = choose_image_size(request, console)
     request = choice.request
     capture = choice.capture or load_capture(request.capture, request.options)
     for warning in capture.warnings:
         console.print(f"[yellow]note[/] {warning}", highlight=False)
+    method = request.method()
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
-    status = _run_status(request, capture, method, console)
+    status = None if is_anew else _run_status(request, capture, method, console)
     estimate = choice.estimate or estimate_capture(capture, request)
     _print_estimate(estimate, method, status, console)
     return estimate
@@ -63,20 +68,22 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
 
 def _estimate_from_images(run_request: RunRequest, console: Console) -> RunEstimate:
     """The whole job of photographs alone; of a capture that was made of them before, what remains."""
-    request = make_sfm_request(run_request)
-    if read_reconstruction(request.output) is not None:
-        options = replace(run_request.options, gps=None, scale_bar=None)
-        with_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
-        return estimate_run(with_capture, console)
-    check_nothing_trained(request, RunFolder(run_request.output))
+    request, run = make_sfm_request(run_request), RunFolder(run_request.output)
     with temporary_frames(request, console) as with_frames:
-        plan = plan_reconstruction(with_frames)
-        sfm = estimate_sfm(plan)
-        print_plan(plan, sfm.text(plan.threads), console)
-        estimate = choose_for_photographs(run_request, plan, sfm, console).estimate
-    assert estimate is not None
-    _print_estimate(estimate, run_request.method(), None, console)
-    return estimate
+        plan, left = look_at_work(with_frames, run)
+        if said := describe_work_left(request, left):
+            trained = "; what was trained on it is deleted" if left != "nothing" and run.is_trained else ""
+            console.print(f"[yellow]note[/] {said}{trained}", highlight=False)
+        if left == "all":
+            sfm = estimate_sfm(plan)
+            print_plan(plan, sfm.text(plan.threads), console)
+            estimate = choose_for_photographs(run_request, plan, sfm, console).estimate
+            assert estimate is not None
+            _print_estimate(estimate, run_request.method(), None, console)
+            return estimate
+    options = replace(run_request.options, gps=None, scale_bar=None)
+    of_capture = replace(run_request, capture=request.output, extra_image_folders=(), options=options)
+    return _estimate_from_capture(of_capture, console, is_anew=left == "placing")
 
 
 def _estimate_from_poses(run_request: RunRequest, size: str | None, console: Console) -> RunEstimate:

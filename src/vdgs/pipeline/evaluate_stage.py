@@ -13,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.capture import View
+from vdgs.captures.capture_metadata import photographs_crc
 from vdgs.captures.off_path import OFF_PATH_FOLDER
 from vdgs.config.commands import ModelName
 from vdgs.distributed.job_folders import clear
@@ -51,7 +52,7 @@ from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
 from vdgs.runs.open_run import ModelLocation, OpenedRun, load_run_blocks, locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import read_json, write_bytes, write_json
+from vdgs.system.atomic_files import read_json, read_json_or_empty, write_bytes, write_json
 from vdgs.system.console import print_warning
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.memory_estimate import render_bytes
@@ -91,7 +92,8 @@ class _Evaluation:
     def create(request: EvaluationRequest) -> _Evaluation:
         """Raises RunError where the model is not trained."""
         run = RunFolder(Path(os.path.abspath(request.path)))  # not resolved: other machines may mount it so
-        return _Evaluation(run, locate_model(run, request.which), request)
+        model = locate_model(run, request.which)
+        return _Evaluation(run, model, replace(request, which=model.name))  # the best may be another one by and by
 
     @property
     def output(self) -> Path:
@@ -120,7 +122,7 @@ class _Evaluation:
         """The views in shards, and what their figures depend on."""
         run, model, request = self.run, self.model, self.request
         weights = None if request.lpips_weights is None else Path(os.path.abspath(request.lpips_weights))
-        request = replace(request, path=run.path, which=model.name, lpips_weights=weights)
+        request = replace(request, path=run.path, lpips_weights=weights)
         blocks = [folder.status().model_id for folder in run.block_folders()] if model.name == "merged" else []
         depends_on = [
             model.stage.status().model_id, model.key, run.coarse_model_id(), blocks, str(weights), request.views
@@ -163,12 +165,15 @@ def evaluate_stage(
     evaluation = _Evaluation.create(request)
     run, model = evaluation.run, evaluation.model
     print_warning(console, model.warning)
+    # Before: a merge meanwhile makes another model, and figures that are out of date.
+    record = measured_as(run, model.name, request.lpips_weights, request.visibility_bins)
+    if request.views == "off-path":
+        record["photographs"] = photographs_crc(context.capture.off_path_views)
     start = time.monotonic()
     if execution is not None and execution.is_distributed:
         peak = _evaluate_in_shards(context, evaluation, execution, console)
     else:
         peak = _evaluate_here(context, evaluation, console)
-    record = measured_as(run, model.name, request.lpips_weights, request.visibility_bins)
     if (
         request.lod_error is not None
         and read_json(evaluation.output / "metrics.json")["psnr_reference_exposure"] is None
@@ -176,6 +181,14 @@ def evaluate_stage(
         record["exposed"] = None  # a tree in the local exposure is measured in neutral colors
     status = record | {"seconds": time.monotonic() - start, "peak_memory_bytes": peak}
     write_json(evaluation.output / "status.json", status)
+
+
+def is_off_path_measured(context: RunContext, name: ModelName) -> bool:
+    """Whether the photographs from where nobody flew are those that a model was measured on, if there are any: they may
+    be added or replaced after the training, which does without them."""
+    views = context.capture.off_path_views
+    record = read_json_or_empty(evaluation_folder(context.run, name, "off-path") / "status.json")
+    return not views or record.get("photographs") == photographs_crc(views)
 
 
 def _evaluate_here(context: RunContext, evaluation: _Evaluation, console: Console) -> int:

@@ -54,7 +54,9 @@ def find_run_motion(context: RunContext, console: Console, device: str = "cpu") 
     """
     run, asked = context.run, context.run.settings().block.mask_moving
     if asked == "off":
-        shutil.rmtree(run.motion_file.parent, ignore_errors=True)
+        if run.motion_file.parent.exists():
+            with run.locked():  # blocks at work read the masks
+                shutil.rmtree(run.motion_file.parent, ignore_errors=True)
         return
     if has_motion_record(run):
         if asked == "auto":

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from vdgs.captures.capture_root import capture_root
 from vdgs.config.commands import RunRequest
 from vdgs.errors import VdgsError
 from vdgs.evaluation.measured_as import is_evaluated
@@ -14,6 +15,7 @@ from vdgs.rendering.ortho.map_status import has_ortho_dependencies, is_ortho_cur
 from vdgs.report.status_cli import full_run_status, next_line
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import with_absolute_paths
+from vdgs.system.atomic_files import read_json_or_empty
 
 
 def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ()) -> str:
@@ -25,10 +27,8 @@ def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ())
     try:
         if not (_same_request(run, request, command) and _is_whole(run, request)):
             return ""
-        options = [each for each in vars(request.options).values() if isinstance(each, Path)]
-        inputs = (request.capture, *request.extra_image_folders, *options, *files)
         made = run.capture_file.stat().st_mtime_ns
-        if any(time > made for path in inputs for time in _times(path)):
+        if any(time > made for time in (*_input_times(request, files), *_photograph_times(run))):
             return ""
     except (OSError, VdgsError):
         return ""
@@ -58,10 +58,33 @@ def _is_whole(run: RunFolder, request: RunRequest) -> bool:
     return status.is_complete and not status.is_running and maps and all(measured)
 
 
+def _input_times(request: RunRequest, files: Sequence[Path]) -> Iterator[int]:
+    """When the files and folders that a command names changed last."""
+    options = with_absolute_paths(request.options, request.capture)
+    outside = [Path(each) for each in (options.images, options.masks) if each and Path(each).is_absolute()]
+    named = [each for each in vars(options).values() if isinstance(each, Path)]
+    for path in (request.capture, *request.extra_image_folders, *named, *outside, *files):
+        yield from _times(path)
+
+
+def _photograph_times(run: RunFolder) -> Iterator[int]:
+    """When the folders that hold photographs or masks of the capture changed last, and the files in them: those of a
+    project may lie anywhere."""
+    root = capture_root(Path(run.settings().capture_path))
+    for folder in read_json_or_empty(run.cameras_file).get("input_folders", ()):
+        yield os.stat(root / folder).st_mtime_ns
+        yield from (os.stat(entry.path).st_mtime_ns for entry in os.scandir(root / folder))
+
+
 def _times(path: Path) -> Iterator[int]:
-    """When a file changed last; of a folder, also of everything in the folder."""
+    """When a file changed last; of a folder, also of everything in the folder, also by links to other folders."""
     yield path.stat().st_mtime_ns
-    if path.is_dir():
-        for folder, _, names in os.walk(path):
-            yield os.stat(folder).st_mtime_ns
-            yield from (os.stat(os.path.join(folder, name)).st_mtime_ns for name in names)
+    seen = set[tuple[int, int]]()  # a link may lead to a folder around it
+    for folder, inner, names in os.walk(path, followlinks=True):
+        status = os.stat(folder)
+        if (status.st_dev, status.st_ino) in seen:
+            inner.clear()
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        yield status.st_mtime_ns
+        yield from (os.stat(os.path.join(folder, name)).st_mtime_ns for name in names)

@@ -100,10 +100,8 @@ def partition_run(
     RunError without a coarse model, and what `ShardedJob.send` raises.
     """
     run = context.run
-    keys, before = run.keys(), _or_none(run.partition_record) or PartitionRecord()
-    saved = _or_none(lambda: load_blocks(run.partition / BLOCKS_FILE)) if before.key == keys.partition else None
-    has_assignment = saved is not None and before.assignment_key == keys.assignment
-    if has_assignment and _or_none(lambda: load_scores(run.partition / SCORES_FILE)) is not None:
+    keys, before, saved = run.keys(), _record_or_empty(run), _saved_blocks(run)
+    if is_cut(run):
         console.print(f"{run.partition}: already cut; nothing to do", highlight=False)
         return
     with run.locked():
@@ -150,6 +148,12 @@ def partition_run(
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
 
 
+def is_cut(run: RunFolder) -> bool:
+    """Whether the scene is cut and its cameras are assigned, with the settings of the run."""
+    has_assignment = _saved_blocks(run) is not None and _record_or_empty(run).assignment_key == run.keys().assignment
+    return has_assignment and _or_none(lambda: load_scores(run.partition / SCORES_FILE)) is not None
+
+
 def explain_view(run: RunFolder, view: str, console: Console) -> None:
     """How well a training view shows each block, and why it was assigned to it or not. RunError for another name."""
     names, scores, assignment = load_scores(run.partition / SCORES_FILE)
@@ -175,6 +179,16 @@ def _or_none(load: Callable[[], Loaded]) -> Loaded | None:
         return load()
     except RunError:
         return None
+
+
+def _record_or_empty(run: RunFolder) -> PartitionRecord:
+    return _or_none(run.partition_record) or PartitionRecord()
+
+
+def _saved_blocks(run: RunFolder) -> Blocks | None:
+    """The blocks that are there, if they were cut with the settings of the run."""
+    is_current = _record_or_empty(run).key == run.keys().partition
+    return _or_none(lambda: load_blocks(run.partition / BLOCKS_FILE)) if is_current else None
 
 
 def _job(run: RunFolder, cameras: int) -> ShardedJob:

@@ -21,7 +21,7 @@ from vdgs.evaluation.lpips import check_weights_file
 from vdgs.evaluation.measured_as import evaluation_folder, is_evaluated
 from vdgs.pipeline.build_lod import build_lod
 from vdgs.pipeline.count_visibility import count_run_visibility
-from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage
+from vdgs.pipeline.evaluate_stage import EvaluationRequest, evaluate_stage, is_off_path_measured
 from vdgs.pipeline.find_motion import find_run_motion
 from vdgs.pipeline.image_size import choose_for_photographs, choose_image_size, names_size
 from vdgs.pipeline.merge_blocks import merge_run_blocks
@@ -184,7 +184,7 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], request: R
     check_stop_requested()
     run = context.run
     weights, bins = request.lpips_weights, request.visibility_bins
-    if is_evaluated(run, which, weights, bins):
+    if is_evaluated(run, which, weights, bins) and is_off_path_measured(context, which):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
     evaluation = EvaluationRequest(

@@ -179,7 +179,11 @@ def _train(
     )  # fmt: skip
     preparation_seconds, views = time.monotonic() - start, plan.views
     metadata = ModelMetadata(
-        capture=capture_metadata(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
+        capture=capture_metadata(opened.capture),
+        version=__version__,
+        block=index,
+        views=len(views),
+        key=run.keys().blocks,
     )
     if not plan.can_train:
         keep_coarse_block(folder, replace(coarse, anchors=plan.anchors, metadata=metadata), len(views), console)

@@ -55,7 +55,8 @@ def train_blocks(
         context.release_models()  # the memory is for the blocks
         views = with_motion_masks(run, context.capture).train_views
         cameras = [view.camera for view in views]
-        files = [run.config_file, run.coarse.model, *image_and_mask_files(views)]
+        records = [run.motion_file] if run.motion_file.exists() else []  # decides on keys and masks
+        files = [run.config_file, run.coarse.model, *records, *image_and_mask_files(views)]
         job = ShardedJob(
             worker="block", request=options, folder=run.path / "blocks", kind=BLOCK_LABELS,
             spans=tuple(range(index, index + 1) for index in range(len(blocks))),

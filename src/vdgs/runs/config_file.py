@@ -18,7 +18,7 @@ import yaml
 
 from vdgs import __version__
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.options import off_flag
+from vdgs.config.options import off_flag, option_words
 from vdgs.config.presets import PRESETS
 from vdgs.config.ranges import to_flag
 from vdgs.config.serialization import diff_settings
@@ -72,10 +72,10 @@ def _words(setting: str, value: Any) -> list[str]:
     flag = setting_flag(setting)
     if isinstance(value, bool):
         return [flag if value else off_flag(flag)]
-    words = [flag]
+    words = list[str]()
     for item in value if isinstance(value, list) else [value]:
         words += map(str, item if isinstance(item, list) else [item])
-    return words
+    return option_words(flag, words)
 
 
 @dataclass(frozen=True)

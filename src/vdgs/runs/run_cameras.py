@@ -14,6 +14,7 @@ from jaxtyping import Float
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_metadata import capture_fingerprint
+from vdgs.captures.capture_root import capture_root
 from vdgs.captures.output_guard import input_folders
 from vdgs.errors import RunError
 from vdgs.geometry.camera import Camera
@@ -80,7 +81,7 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
     if not run.cameras_file.exists():
         return None
     record = read_json(run.cameras_file)
-    root = Path(run.settings().capture_path)
+    root = capture_root(Path(run.settings().capture_path))
     try:
         if record["fingerprint"] != (capture or {}).get("fingerprint"):
             return None

@@ -170,11 +170,13 @@ class RunFolder:
         return self.capture_file.exists()
 
     def discard_training(self) -> None:
-        """Delete what was trained: the capture of the run is about to be made anew."""
-        for folder in (self.coarse, *self.block_folders(), self.merged):
-            if folder.path.exists():
-                folder.reset_unless("")
-        self.capture_file.unlink(missing_ok=True)
+        """Delete what was trained: the capture of the run is about to be made anew. RunError where another process
+        works on the run, such as blocks whose driver died."""
+        with self.locked():
+            for folder in (self.coarse, *self.block_folders(), self.merged):
+                if folder.path.exists():
+                    folder.reset_unless("")
+            self.capture_file.unlink(missing_ok=True)
 
     def move_capture(self, to: Path) -> None:
         """Save that the capture of the run lies elsewhere now, with the files in it that options name; the caller

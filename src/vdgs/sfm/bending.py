@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm.gcp_list import GcpObservation
-from vdgs.sfm.georegistration import Georegistration, model_points
+from vdgs.sfm.georegistration import Georegistration, model_points, transform_model
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
@@ -18,6 +19,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 MOST_BENT = 0.1
 #: Positions tell how a model is bent where they are good to this share of the flying height (choice), and so many.
 GOOD_SHARE, ENOUGH_POSITIONS = 0.01, 6
+#: Points that an image counts with: its center and one along each of its axes.
+TRIAD = 4
 
 
 def bend_to_positions(
@@ -29,7 +32,7 @@ def bend_to_positions(
     threads: int,
 ) -> pycolmap.Reconstruction:
     """A bundle adjustment with positions that were found to be good as priors; the model as it is where they are not,
-    and where that would tear it."""
+    and where that would tear it. Positions decide the shape: the bent model lies as the model did (`_laid_back`)."""
     accuracy = placed.accuracy
     if accuracy is None or accuracy.positions_m is None or accuracy.altitude != "used":
         return model
@@ -56,11 +59,23 @@ def bend_to_positions(
     known.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     adjuster = pycolmap.create_pose_prior_bundle_adjuster(_options(hold_focal, threads), known, config, priors, bent)
     call_cancellable(lambda cancellation_token: adjuster.solve())
+    transform_model(bent, _laid_back(model, bent, [prior.corr_data_id.id for prior in priors]))
     bent.update_point_3d_errors()
     if _tears(model, bent) is not None:
         return model
     drop_unseen_observations(bent)
     return bent
+
+
+def tell_level(placed: Georegistration) -> bool:
+    """Whether positions alone tell level as well as it is known by all: not along a line that is straight to what they
+    are wrong by."""
+    accuracy = placed.accuracy
+    if accuracy is None or accuracy.positions_m is None or accuracy.level_deg is None:
+        return False
+    used = placed.targets[placed.inliers]
+    across = float(np.linalg.svd(used - used.mean(axis=0), compute_uv=False)[1])
+    return 2 * np.degrees(np.arctan2(max(accuracy.positions_m), across)) <= accuracy.level_deg
 
 
 def bend_to_points(
@@ -119,6 +134,30 @@ def _height(model: pycolmap.Reconstruction) -> float:
     """Median distance of the cameras to the median point."""
     centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
     return float(np.median(np.linalg.norm(centers - np.median(model_points(model), axis=0), axis=1)))
+
+
+def _laid_back(model: pycolmap.Reconstruction, bent: pycolmap.Reconstruction, numbers: Sequence[int]) -> Similarity:
+    """The similarity that brings a bent model back to where the model lies, by these of its images.
+
+    The adjustment knows positions alone, neither distances nor up, and begins with a similarity to them, which along a
+    line is turned about it by chance: the directions of the cameras say that turn, their centers do not.
+    """
+    before, after = (_triads(each, numbers) for each in (model, bent))
+    rotation = fit_similarity(after, before).rotation
+    old, new = before[::TRIAD], after[::TRIAD] @ rotation.T
+    middle, moved = old.mean(axis=0), new.mean(axis=0)
+    scale = float(((old - middle) * (new - moved)).sum() / ((new - moved) ** 2).sum())
+    return Similarity(scale, rotation, middle - scale * moved)
+
+
+def _triads(model: pycolmap.Reconstruction, numbers: Sequence[int]) -> np.ndarray:
+    """Of each of these images its center and a point along each of its axes, as far off as what cameras see."""
+    height, rows = _height(model), []
+    for number in numbers:
+        image = model.image(number)
+        center = image.projection_center()
+        rows += [center, *(center + height * image.cam_from_world().rotation.matrix())]
+    return np.array(rows)
 
 
 def _tears(model: pycolmap.Reconstruction, bent: pycolmap.Reconstruction) -> float | None:

@@ -16,6 +16,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm import incremental_mapper
 from vdgs.sfm.global_mapper import MAX_WORSE_PX
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.panoramas import rig_configs
 from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.rig_folders import MIN_FRAMES, degrees_from_mean
 from vdgs.sfm.workspace import Workspace, explain_colmap_errors
@@ -49,7 +50,19 @@ def map_rigs(
             why = str(error)
     if why:
         incremental_mapper.take_models_back(workspace)
+        take_rigs_apart(workspace, photographs)
         console.print(f"[yellow]note[/] the cameras of rigs are not held together: {escape(why)}", highlight=False)
+
+
+def take_rigs_apart(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> None:
+    """Let each camera of rigs move on its own in COLMAP's database, as before `map_rigs`: a first model without rigs
+    tells how they lie. The views of panoramas stay together."""
+    if not any(photo.sensor for photo in photographs):
+        return
+    views = rig_configs(photographs)
+    with explain_colmap_errors(workspace.path), workspace.open_database() as database:
+        if sum(rig.num_sensors() > 1 for rig in database.read_all_rigs()) > len(views):
+            pycolmap.apply_rig_config(views, database)  # makes all anew: a rig for each camera that these do not name
 
 
 def _why_not(loose: pycolmap.Reconstruction, rigid: pycolmap.Reconstruction) -> str:

@@ -51,16 +51,26 @@ class Undistortion:
 
 
 def make_undistortion(bent: Intrinsics, max_size: int) -> Undistortion:
-    """The pinhole camera and the way to it; `max_size` bounds the longer side (0: not at all)."""
+    """The pinhole camera and the way to it; `max_size` bounds the longer side (0: not at all). The map takes 8 bytes a
+    pixel, and seconds."""
     pinhole = undistorted_pinhole(bent)
+    return Undistortion(sampling_map(bent, pinhole), *_shrunk(pinhole, max_size))
+
+
+def straight_camera(bent: Intrinsics, max_size: int) -> Intrinsics:
+    """The pinhole camera of `make_undistortion` alone, without the map."""
+    return _shrunk(undistorted_pinhole(bent), max_size)[1]
+
+
+def _shrunk(pinhole: Intrinsics, max_size: int) -> tuple[tuple[int, int], Intrinsics]:
+    """Width and height of a pinhole picture after shrinking, and its camera with sides that are multiples."""
     longer = max(pinhole.width, pinhole.height)
     scale = min(1.0, max_size / longer) if max_size else 1.0
     width, height = round(pinhole.width * scale), round(pinhole.height * scale)
     across, up = width / pinhole.width, height / pinhole.height
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
     kept = width - width % SIDE_MULTIPLE, height - height % SIDE_MULTIPLE
-    target = Intrinsics("PINHOLE", (fx * across, fy * up, cx * across, cy * up), *kept)
-    return Undistortion(sampling_map(bent, pinhole), (width, height), target)
+    return (width, height), Intrinsics("PINHOLE", (fx * across, fy * up, cx * across, cy * up), *kept)
 
 
 def read_lenses(output: Path) -> dict[int, Intrinsics]:
@@ -113,30 +123,53 @@ def write_images(
     output: Path,
     workspace: Workspace,
     names: Mapping[int, Sequence[str]],
-    undistortions: Mapping[int, Undistortion],
+    lenses: Mapping[int, Intrinsics],
+    max_size: int,
     threads: int,
     tell: Callable[[int], object],
 ) -> None:
-    """Write images, images_2, images_4, and masks of those that have one: `names` of the photographs of each camera.
-    What is there is kept; `tell` is called with how many are done.
+    """Write images, images_2, images_4, and masks of those that have one: `names` of the photographs of each camera,
+    and the lenses of these; `max_size` bounds the longer side (0: not at all). What is there is kept; `tell` is called
+    with how many are done.
 
     Raises CaptureError for photographs that cannot be decoded, VdgsError where the disk is full.
     """
     done = 0
     tell(done)
     with ThreadPoolExecutor(threads) as pool:
-        for camera, members in names.items():
-            for _ in pool.map(partial(_write_one, output, workspace, undistortions[camera]), members):
-                check_stop_requested()
-                done += 1
-                tell(done)
+        for camera, members in names.items():  # one at a time, however many there are: maps take memory
+            check_stop_requested()
+            missing = [name for name in members if not _is_written(output, workspace, name)]
+            done += len(members) - len(missing)
+            if missing:
+                undistort = partial(_write_one, output, workspace, make_undistortion(lenses[camera], max_size))
+                for _ in pool.map(undistort, missing):
+                    check_stop_requested()
+                    done += 1
+                    tell(done)
+                del undistort  # before the next map is made
+            tell(done)
+
+
+def _is_written(output: Path, workspace: Workspace, name: str) -> bool:
+    return all(target.is_file() for target in _targets(output, name)) and (
+        _mask_target(output, name).is_file() or not workspace.mask(name).is_file()
+    )
+
+
+def _targets(output: Path, name: str) -> list[Path]:
+    return [output / folder / jpeg_name(name) for folder, _ in IMAGE_SIZES]
+
+
+def _mask_target(output: Path, name: str) -> Path:
+    return output / MASK_FOLDER / f"{jpeg_name(name)}.png"
 
 
 def _write_one(output: Path, workspace: Workspace, undistortion: Undistortion, name: str) -> None:
     check_stop_requested()
     if workspace.mask(name).is_file():
         _write_mask(output, workspace.mask(name), undistortion, name)
-    targets = [output / folder / jpeg_name(name) for folder, _ in IMAGE_SIZES]
+    targets = _targets(output, name)
     if all(target.is_file() for target in targets):
         return
     pixels, _ = decode_image((workspace.images / name).resolve())
@@ -154,7 +187,7 @@ def _write_one(output: Path, workspace: Workspace, undistortion: Undistortion, n
 
 
 def _write_mask(output: Path, mask: Path, undistortion: Undistortion, name: str) -> None:
-    target = output / MASK_FOLDER / f"{jpeg_name(name)}.png"
+    target = _mask_target(output, name)
     if not target.is_file():
         keep = undistort_mask(mask, undistortion.grid, undistortion.resized)[
             : undistortion.intrinsics.height, : undistortion.intrinsics.width
@@ -176,7 +209,7 @@ def write_model(
             model="PINHOLE", width=kept.width, height=kept.height, params=list(kept.params), camera_id=number
         )
         straight.add_camera_with_trivial_rig(camera)
-    places: dict[tuple[int, int], int] = {}
+    places: dict[int, np.ndarray] = {}  # of each image, by its features: the number of an observation, or -1
     for image in placed_images(model):
         seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
         bent = np.array([image.points2D[k].xy for k in seen]).reshape(-1, 2)
@@ -185,7 +218,8 @@ def write_model(
         seen, rays = [k for k, there in zip(seen, shown, strict=True) if there], rays[shown]
         camera_id = image.camera_id if pinhole_of is None else pinhole_of[image.name]
         fx, fy, cx, cy = pinholes[camera_id].params
-        places |= {(image.image_id, k): place for place, k in enumerate(seen)}
+        places[image.image_id] = np.full(image.num_points2D(), -1, np.int32)
+        places[image.image_id][seen] = np.arange(len(seen))
         straight.add_image_with_trivial_frame(
             pycolmap.Image(
                 name=jpeg_name(image.name), keypoints=rays * [fx, fy] + [cx, cy], camera_id=camera_id,
@@ -196,9 +230,9 @@ def write_model(
     for point in model.points3D.values():
         track = pycolmap.Track(
             [
-                pycolmap.TrackElement(each.image_id, places[each.image_id, each.point2D_idx])
+                pycolmap.TrackElement(each.image_id, int(places[each.image_id][each.point2D_idx]))
                 for each in point.track.elements
-                if (each.image_id, each.point2D_idx) in places
+                if each.image_id in places and places[each.image_id][each.point2D_idx] >= 0
             ]
         )
         number = straight.add_point3D(point.xyz, track, point.color)

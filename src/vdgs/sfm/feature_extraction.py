@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.image_metadata import FISHEYE, RADIAL, ImageMetadata
 from vdgs.sfm.mask_files import apply_orientation
-from vdgs.sfm.panoramas import cut_view
+from vdgs.sfm.panoramas import cut_view, read_panorama
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.atomic_files import write_atomic, write_bytes
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -92,27 +94,54 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     return kinds
 
 
-def prepare_images(workspace: Workspace, photographs: Sequence[ImageMetadata], console: Console) -> list[ExcludedImage]:
-    """As `write_upright_images`, with the progress where photographs are of kinds that take long to decode."""
-    if not any(photo.kind or photo.face for photo in photographs):
-        return write_upright_images(workspace, photographs)
+def prepare_images(
+    workspace: Workspace, photographs: Sequence[ImageMetadata], threads: int, console: Console
+) -> list[ExcludedImage]:
+    """As `write_upright_images`, with the progress where photographs are to be decoded, which takes long."""
+    if not any(_is_decoded(photo) and not (workspace.images / photo.name).exists() for photo in photographs):
+        return write_upright_images(workspace, photographs, threads)
     with report_progress(workspace, console, "features", len(photographs), "decoded, ") as tell:
-        return write_upright_images(workspace, photographs, tell)
+        return write_upright_images(workspace, photographs, threads, tell)
 
 
 def write_upright_images(
-    workspace: Workspace, photographs: Sequence[ImageMetadata], tell: Callable[[int], object] = lambda _done: None
+    workspace: Workspace,
+    photographs: Sequence[ImageMetadata],
+    threads: int,
+    tell: Callable[[int], object] = lambda _done: None,
 ) -> list[ExcludedImage]:
     """Fill the work folder with links to the photographs, upright copies of those that EXIF says lie, and JPEGs in sRGB
     of those of other kinds.
 
-    Returns those that could not be decoded. Photographs themselves are never changed.
+    Returns those that could not be decoded, in the order of their files. Photographs themselves are never changed.
     """
-    failed = []
-    # In the order of the files: the views of a panorama one after the other.
-    for number, photo in enumerate(sorted(photographs, key=lambda photo: str(photo.path))):
+    of_file: dict[Path, list[ImageMetadata]] = {}
+    for photo in sorted(photographs, key=lambda photo: str(photo.path)):
+        of_file.setdefault(photo.path, []).append(photo)
+    failed, done = list[ExcludedImage](), 0
+    tell(done)
+    with ThreadPoolExecutor(threads) as pool:
+        for members, lost in zip(
+            of_file.values(), pool.map(partial(_prepare, workspace), of_file.values()), strict=True
+        ):
+            check_stop_requested()
+            failed += lost
+            done += len(members)
+            tell(done)
+    return failed
+
+
+def _is_decoded(photo: ImageMetadata) -> bool:
+    """Whether a photograph is decoded to be prepared; others are linked, or copied as they are."""
+    is_jpeg = photo.path.suffix.lower() in _JPEGS
+    return bool(photo.kind or photo.face or photo.orientation != 1 or not is_jpeg)
+
+
+def _prepare(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[ExcludedImage]:
+    """Links or copies of the photographs of one file, several where it is a panorama; those that cannot be decoded."""
+    failed, panorama = list[ExcludedImage](), cache(partial(read_panorama, photographs[0]))
+    for photo in photographs:
         check_stop_requested()
-        tell(number)
         target = workspace.images / photo.name
         if target.exists():
             continue
@@ -123,7 +152,7 @@ def write_upright_images(
             continue
         try:
             if photo.face:
-                _save(Image.fromarray(cut_view(photo)), target, "JPEG")
+                _save(Image.fromarray(cut_view(photo, panorama())), target, "JPEG")
             elif photo.kind:
                 upright = apply_orientation(decode_image(photo.path)[0], photo.orientation)
                 _save(Image.fromarray(np.ascontiguousarray(upright)), target, "JPEG")

@@ -148,6 +148,12 @@ def copy_features(workspace: Workspace, name: str, copy: str) -> None:
         database.write_descriptors(number, database.read_descriptors(image.image_id))
 
 
+def count_pairs(workspace: Workspace) -> int:
+    """The pairs that were compared, whether or not they match."""
+    with workspace.open_database() as database:
+        return int(database.num_verified_image_pairs())
+
+
 def count_inliers(workspace: Workspace) -> list[int]:
     """The matches of each pair that were verified."""
     with workspace.open_database() as database:

@@ -74,6 +74,22 @@ class Surveyed:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class SurveyedFit:
+    """A similarity to surveyed points [n]."""
+
+    known: np.ndarray
+    """Whose heights are known, [n] bool."""
+    is_level: bool
+    """Whether these are too few to level a model, which then has heights of its own."""
+    aims: Float[np.ndarray, "n 3"]
+    """Where they were surveyed, with heights."""
+    similarity: Similarity
+    trusted: np.ndarray
+    """Which of them count, [n] bool."""
+    accuracy: AccuracyFacts
+
+
 def triangulate(model: pycolmap.Reconstruction, point: GroundControlPoint) -> TriangulatedPoint | None:
     """Where the placed photographs see a point; None where fewer than two show it from different places.
 
@@ -187,24 +203,21 @@ def adjust_to_gcps(
     rows = np.array([k for k, _ in used], int)
     _check_enough(targets[rows], len(wrong), gcps.source)
     places = np.array([seen.position for _, seen in used])
-    known = np.isfinite(targets[rows, 2])
-    is_level = is_collinear(places[known])  # too few heights
-    aims = _with_heights(places, targets[rows], is_level, level)
-    similarity, trusted = fit_to_gcps(places, aims)
-    said = doubts(similarity, places[trusted], aims[trusted]) if doubts is not None else ""
+    fit = fit_surveyed(places, targets[rows], level)
+    known, trusted, accuracy = fit.known, fit.trusted, fit.accuracy
+    said = doubts(fit.similarity, places[trusted], fit.aims[trusted]) if doubts is not None else ""
     if said:
         raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
-    transform_model(model, similarity)
-    accuracy = gcp_accuracy(similarity.apply(places[trusted]), aims[trusted], int(known[trusted].sum()))
+    transform_model(model, fit.similarity)
     notes: tuple[str, ...] = ()
     kept, firm = rows[trusted].tolist(), rows[trusted & known].tolist()
-    if is_level:
+    if fit.is_level:
         across = accuracy.place_m[:1] if accuracy.place_m else ()
         up_m = () if level.gps_up_m is None or known.any() else (level.gps_up_m,)
         accuracy = replace(accuracy, place_m=(*across, *up_m), level_deg=2 * level.deviation_deg)
         by = "points with heights" if known.any() else "GPS" if level.gps is not None else "nothing"
         notes = (f"too few control points have heights to level or to bend the model: heights are by {by}.",)
-    elif is_collinear(aims[trusted & known]):
+    elif is_collinear(fit.aims[trusted & known]):
         notes = ("too few control points with heights fit the others to bend the model; it is not bent.",)
     else:
         model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in firm], fix_focal, threads)
@@ -215,6 +228,17 @@ def adjust_to_gcps(
         accuracy = replace(accuracy, place_m=(with_datum, *accuracy.place_m[1:]))
     doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
     return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
+
+
+def fit_surveyed(places: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], level: Level) -> SurveyedFit:
+    """The similarity from places that a model has to where they were surveyed (NaN: no height), and how good it is."""
+    known = np.isfinite(targets[:, 2])
+    is_level = is_collinear(places[known])
+    aims = _with_heights(places, targets, is_level, level)
+    similarity, trusted = fit_to_gcps(places, aims)
+    measured = 0 if is_level else int(known[trusted].sum())  # those of a levelled model are its own
+    accuracy = gcp_accuracy(similarity.apply(places[trusted]), aims[trusted], measured)
+    return SurveyedFit(known, is_level, aims, similarity, trusted, accuracy)
 
 
 def _check_enough(targets: Float[np.ndarray, "n 3"], num_wrong: int, source: str) -> None:
@@ -341,9 +365,13 @@ def measure_gcps(
     gcps: GcpList,
     origin: tuple[float, float, float],
     outliers: frozenset[str],
+    knows_altitude: bool,
 ) -> tuple[GcpReport, ...]:
-    """What a placed model makes of all points: seen minus surveyed, metres east, north, up."""
+    """What a placed model makes of all points: seen minus surveyed, metres east, north, and up unless nothing says how
+    high the model lies."""
     targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
+    if not knows_altitude:
+        targets[:, 2] = np.nan
     facts = []
     for k, point in enumerate(gcps.points):
         seen = located.get(k)

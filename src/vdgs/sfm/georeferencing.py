@@ -15,7 +15,7 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, rotation_to_z
 from vdgs.sfm import gcp_adjustment, georegistration
-from vdgs.sfm.bending import bend_to_positions
+from vdgs.sfm.bending import bend_to_positions, tell_level
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
@@ -69,7 +69,9 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
         return Georeferenced(model, placed, None, ())
     survey: tuple[GcpReport, ...] = ()
     if control is not None and placed.is_georeferenced:
-        survey = gcp_adjustment.measure_gcps(model, control, prepared.origin, doubtful)
+        survey = gcp_adjustment.measure_gcps(
+            model, control, prepared.origin, doubtful, _knows_altitude(prepared, placed)
+        )
     ground = float(np.median(georegistration.model_points(model)[:, 2]))
     _refuse_upside_down(model, ground, placed, prepared)
     georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
@@ -162,11 +164,15 @@ def _in_feet(ratio: float) -> str:
 def _bent(
     model: pycolmap.Reconstruction, placed: Georegistration, prepared: ReconstructionPlan, hold_focal: bool
 ) -> tuple[pycolmap.Reconstruction, Georegistration]:
-    """The model bent by positions that are good for that, and how far they are from it then."""
+    """The model bent by positions that are good for that, and how far they are from it then. What is bent fits them
+    better: how large, how level and where it is comes anew of all that is known, if they do not leave level open."""
     photographs, positions = prepared.image_list.images, prepared.gps_priors
     bent = bend_to_positions(model, photographs, positions, placed, hold_focal, prepared.threads)
     if bent is model:
         return model, placed
+    anew = _by_positions(bent, prepared) if tell_level(placed) else None
+    if isinstance(anew, Georegistration) and anew.is_georeferenced:
+        georegistration.transform_model(bent, anew.similarity)
     lies = georegistration.registration_in_place(bent, photographs, positions, placed.method)
     off = lies.targets - placed.targets
     return bent, replace(placed, residuals=lies.residuals + off[:, : lies.residuals.shape[1]])

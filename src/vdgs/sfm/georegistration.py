@@ -14,7 +14,8 @@ from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
-from vdgs.geometry.similarity import Similarity, is_collinear, rotation_to_z
+from vdgs.geometry.similarity import Similarity, geometric_median, is_collinear, rotation_to_z
+from vdgs.sfm.attitude_tilt import HANGS_DEG, tilt_of_attitudes
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -24,18 +25,18 @@ from vdgs.system.units import two_digits
 
 #: Attitudes that agree on which way a world lies, at least.
 MIN_ATTITUDES = 3
-#: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
-MIN_HEADING_SPREAD = 0.3
 #: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, and by so
 #: many standard deviations of it, are no measurements (choice).
 SCATTER_DEG, CONTRADICT_DEG, CONTRADICT_SIGMAS = 20.0, 45.0, 3.0
+#: So large a share of recorded attitudes that contradict the others is told (choice).
+WRONG_ATTITUDES = 0.1
 #: What errors about up and about mirror images ask where it is from attitudes, and is down by the views.
 LOOKED_UP = (
     " Or are the recorded attitudes wrong, by which the cameras looked up (a pitch of +90° where straight down "
     "is -90°)?"
 )
-#: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
-HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
+#: How far a camera may hang beside what is recorded, in degrees, where all look one way (choice).
+HANGS_ALIKE_DEG = 2.5
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
@@ -109,6 +110,7 @@ def georegister(
         centers=centers,
         targets=targets,
         times=_moments(taken),
+        flights=positions.flights[rows] if len(positions.flights) == len(positions) else None,
         up=up,
         scale=scale,
         stated=positions.gps_std[rows] if stated else None,
@@ -132,7 +134,7 @@ def georegister(
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
     fit, of_reading = _checked_reading(fit, problem, positions, offsets)
-    on_a_line = is_nearly_collinear(targets, positions.gps_std[rows])
+    on_a_line = is_nearly_collinear(targets[fit.inliers], positions.gps_std[rows][fit.inliers])
     fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
     fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
@@ -152,7 +154,7 @@ def georegister(
         targets=fit.placed - fit.residuals,
         residuals=_recorded(fit.placed - levelled.targets, positions),
         inliers=fit.inliers,
-        accuracy=accuracy_of(fit, targets, positions, offsets),
+        accuracy=accuracy_of(fit, positions, offsets),
         notes=tuple(notes),
     )
 
@@ -170,12 +172,10 @@ def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
     return values if positions.has_altitudes else values[..., :2]
 
 
-def accuracy_of(
-    fit: PositionFit, targets: np.ndarray, positions: GpsPriors, offsets: AltitudeOffsets | None = None
-) -> AccuracyFacts:
-    """The accuracy of a fit, for people."""
+def accuracy_of(fit: PositionFit, positions: GpsPriors, offsets: AltitudeOffsets | None = None) -> AccuracyFacts:
+    """The accuracy of a fit, for people; the edge of the flight is where photographs are, not stray positions."""
     place = fit.place_error_m if positions.has_altitudes else fit.place_error_m[:1]
-    away = np.linalg.norm(targets[:, :2] - targets[:, :2].mean(axis=0), axis=1)
+    away = np.linalg.norm(fit.placed[:, :2] - fit.placed[:, :2].mean(axis=0), axis=1)
     return AccuracyFacts(
         place_m=place, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
         north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
@@ -384,18 +384,21 @@ def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
     rotations = np.array([_rotation(images[photo.name]) for photo in seen])
     down = np.array([photo.attitude.gravity for photo in seen if photo.attitude is not None])
     ups = -np.einsum("nji,nj->ni", rotations, down)
-    mean = ups.mean(axis=0) / max(float(np.linalg.norm(ups.mean(axis=0))), 1e-12)
+    middle = geometric_median(ups)  # some may be wrong
+    mean = middle / max(float(np.linalg.norm(middle)), 1e-12)
     scatter = float(np.median(np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))))
     apart = float(np.degrees(np.arccos(np.clip(mean @ direction, -1, 1))))
     level = rotation_to_z(mean)
-    tilt, several = _tilt(rotations @ level.T, down)
+    tilt, several, agree = tilt_of_attitudes(rotations @ level.T, down)
     most = max(CONTRADICT_DEG, CONTRADICT_SIGMAS * views.deviation_deg)
     if scatter > SCATTER_DEG or (sure and not several and apart > most):
         return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
     found = level.T @ np.append(-tilt, 1.0)
     deviation = float(np.hypot(scatter / np.sqrt(len(seen)), HANGS_DEG if several else HANGS_ALIKE_DEG))
-    doubt = LOOKED_UP if apart > 90 else ""
-    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes", doubt=doubt), []
+    doubt, wrong = LOOKED_UP if apart > 90 else "", int((~agree).sum())
+    many = wrong >= WRONG_ATTITUDES * len(seen)
+    notes = [f"{wrong} of {len(seen)} recorded attitudes contradict the others, and are not used."] if many else []
+    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes", doubt=doubt), notes
 
 
 def registration_in_place(
@@ -453,23 +456,8 @@ def tilt_from_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Im
     if len(images) < MIN_ATTITUDES:
         return None
     rotations = np.array([_rotation(image) for image in images])
-    tilt, _ = _tilt(rotations, np.array([gravity[image.name] for image in images]))
+    tilt, _, _ = tilt_of_attitudes(rotations, np.array([gravity[image.name] for image in images]))
     return float(np.degrees(np.linalg.norm(tilt)))
-
-
-def _tilt(rotations: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Tilt of a world whose up is about z, [2] in radians, and whether it was told from how the camera hangs:
-    camera_from_world [n, 3, 3] and recorded down in the cameras [n, 3]."""
-    off = gravity + rotations[:, :, 2]
-    hangs = np.broadcast_to(np.eye(3)[:, :2], (len(rotations), 3, 2))
-    several = False
-    for unknown in (np.concatenate([rotations[:, :, :2], hangs], axis=2), rotations[:, :, :2]):
-        flat = unknown.reshape(-1, unknown.shape[2])
-        singular = np.linalg.svd(flat, compute_uv=False)
-        if singular[-1] > MIN_HEADING_SPREAD * singular[0]:
-            several = unknown.shape[2] == 4
-            break
-    return np.linalg.lstsq(flat, off.ravel(), rcond=None)[0][:2], several
 
 
 def _match_positions(

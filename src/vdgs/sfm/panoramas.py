@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,25 +59,30 @@ def _views(photo: ImageMetadata, kind: int) -> list[ImageMetadata]:
     ]  # fmt: skip
 
 
-def cut_view(view: ImageMetadata) -> np.ndarray:
-    """The pixels [h, w, 3] of a face. Raises CaptureError where the panorama cannot be decoded."""
-    return cut_face(_upright(view.path, view.orientation), view.face, view.width)
+def read_panorama(view: ImageMetadata) -> np.ndarray:
+    """The upright pixels [h, w, 3] of the panorama of a face. Raises CaptureError where it cannot be decoded."""
+    return np.ascontiguousarray(apply_orientation(decode_image(view.path)[0], view.orientation))
 
 
-@lru_cache(1)
-def _upright(path: Path, orientation: int) -> np.ndarray:
-    return np.ascontiguousarray(apply_orientation(decode_image(path)[0], orientation))
+def cut_view(view: ImageMetadata, panorama: np.ndarray) -> np.ndarray:
+    """The pixels [h, w, 3] of a face."""
+    return cut_face(panorama, view.face, view.width)
 
 
 def apply_rigs(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> None:
     """Let the views of each panorama move as one in COLMAP's database, once it has all of them."""
-    folders = sorted({view.name.split("/")[0].rpartition("_")[0] for view in photographs if view.face})
-    configs = [pycolmap.RigConfig(cameras=[_rig_camera(folder, face) for face in FACES]) for folder in folders]
+    configs = rig_configs(photographs)
     if not configs:
         return
     with workspace.open_database() as database:
         if not any(rig.num_sensors() > 1 for rig in database.read_all_rigs()):
             pycolmap.apply_rig_config(configs, database)
+
+
+def rig_configs(photographs: Sequence[ImageMetadata]) -> list[pycolmap.RigConfig]:
+    """The rigs of views: one for each size of panoramas."""
+    folders = sorted({view.name.split("/")[0].rpartition("_")[0] for view in photographs if view.face})
+    return [pycolmap.RigConfig(cameras=[_rig_camera(folder, face) for face in FACES]) for folder in folders]
 
 
 def _rig_camera(folder: str, face: str) -> pycolmap.RigConfigCamera:

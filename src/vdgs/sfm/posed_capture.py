@@ -146,7 +146,7 @@ def _find_features(
     images = [image for group in groups for image in group.images]
     feature_extraction.create_database(bent, groups)
     write_on_white(photographs, bent)
-    _refuse_damaged(feature_extraction.write_upright_images(bent, images))
+    _refuse_damaged(feature_extraction.write_upright_images(bent, images, threads))
     if not work.is_done(FEATURES, keys[FEATURES]):
         mask_files.write_upright_masks(bent, images, threads)
         there = feature_extraction.count_features(bent)
@@ -338,17 +338,12 @@ def _write(
     members: dict[Intrinsics, list[str]] = {}
     for view in photographs.views:
         members.setdefault(view.file.intrinsics, []).append(view.view.name)
-    lenses, lens_of, done = dict[int, Intrinsics](), dict[str, int](), 0
+    size, bent_lenses = request.options.max_output_size, dict(enumerate(members, 1))
+    names = {number: members[lens] for number, lens in bent_lenses.items()}
     with report_progress(work, console, "writing", len(photographs.views), "without distortion, ") as tell:
-        for number, (lens, names) in enumerate(members.items(), 1):  # one at a time: maps take memory
-            straight = capture_writer.make_undistortion(lens, request.options.max_output_size)
-
-            def told(count: int, before: int = done) -> None:
-                tell(before + count)
-
-            capture_writer.write_images(output, bent, {number: names}, {number: straight}, threads, told)
-            lenses[number], done = straight.intrinsics, done + len(names)
-            lens_of |= dict.fromkeys(names, number)
+        capture_writer.write_images(output, bent, names, bent_lenses, size, threads, tell)
+    lenses = {number: capture_writer.straight_camera(lens, size) for number, lens in bent_lenses.items()}
+    lens_of = {name: number for number, group in names.items() for name in group}
     color_points(model, output, lenses, lens_of)
     georef = photographs.source.georef
     if georef is not None:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -37,10 +37,10 @@ from vdgs.sfm import (
     incremental_mapper,
     mask_files,
 )
-from vdgs.sfm.camera_rigs import map_rigs
+from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
 from vdgs.sfm.console_report import print_reconstruction_report
 from vdgs.sfm.films.take_frames import with_frames
-from vdgs.sfm.georeferencing import georeference
+from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.panoramas import apply_rigs
 from vdgs.sfm.position_plots import plot_positions, plot_residuals
@@ -69,6 +69,8 @@ from vdgs.system.records import record_to_dict
 
 #: A lens that moves pixels by no more leaves the photographs without distortion as they are.
 LENS_PX = 0.05
+#: What the same command has left to do of a capture: nothing, to place a finished one anew, or to make it or go on.
+WorkLeft = Literal["nothing", "placing", "all"]
 
 
 def reconstruct(
@@ -92,24 +94,24 @@ def reconstruct(
     prepared, digests = plan_reconstruction(request), read_digests(output)
     work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared, digests)
     sources = SourceImages.of(request.image_folders, digests, command)
-    facts = read_reconstruction(output) if _is_finished(output, keys["placed"]) else None
-    if facts is not None:
-        console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
+    left = _work_left(prepared, keys, sources, run)
+    before = None if left == "all" else read_reconstruction(output)
+    if before is not None and left == "nothing":
+        console.print(describe_work_left(request, left), highlight=False)
         if SourceImages.read(output) != sources:  # of files that are not used
             sources.write(output)
         with suppress(VdgsError):  # it saves reading, and the folder may be read-only
             digests.write()
         if not request.keep_intermediate:
             work.remove()
-        return facts
-    check_unchanged(output, sources, request.overwrite)
-    check_nothing_trained(request, run)
-    before = _placed_before(output, keys["capture"])
+        return before
     if before is not None:
+        began = time.monotonic()
+        found = _placed_again(prepared, before)  # may be refused: before anything is deleted or noted
         with writing(request, run):
             sources.write(output)
             digests.write()
-            facts = _place_anew(prepared, before, keys, console)
+            facts = _place_anew(prepared, before, found, keys, began, console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
         print_reconstruction_report(facts, console)
         return facts
@@ -132,6 +134,41 @@ def reconstruct(
         facts = _steps(prepared, work, keys, console)
     print_reconstruction_report(facts, console)
     return facts
+
+
+def look_at_work(request: SfmRequest, run: RunFolder | None) -> tuple[ReconstructionPlan, WorkLeft]:
+    """The look before the work, and what `reconstruct` has left to do, of frames in place of films; nothing is written.
+    Raises what it raises before its work."""
+    prepared, output = plan_reconstruction(request), request.output
+    if SourceImages.read(output) is None and read_reconstruction(output) is None:  # no need to read all photographs
+        check_nothing_trained(request, run)
+        return prepared, "all"
+    digests = read_digests(output)
+    sources = SourceImages.of(request.image_folders, digests)
+    return prepared, _work_left(prepared, step_keys(prepared, digests), sources, run)
+
+
+def describe_work_left(request: SfmRequest, left: WorkLeft) -> str:
+    """What happens to the capture that is there; empty where none is finished."""
+    if read_reconstruction(request.output) is None:
+        return ""
+    return {
+        "nothing": f"{request.output}: made of these photographs already; nothing to do",
+        "placing": f"{request.output}: is placed anew, in seconds; its photographs and poses stay",
+        "all": f"{request.output}: was made of other photographs or with other settings (--sfm.*); it is made anew",
+    }[left]
+
+
+def _work_left(
+    prepared: ReconstructionPlan, keys: dict[str, str], sources: SourceImages, run: RunFolder | None
+) -> WorkLeft:
+    """Raises VdgsError where photographs are others than before, RunError for a run that was trained on the capture."""
+    request, output = prepared.request, prepared.request.output
+    if _is_finished(output, keys["placed"]) and read_reconstruction(output) is not None:
+        return "nothing"
+    check_unchanged(output, sources, request.overwrite)
+    check_nothing_trained(request, run)
+    return "placing" if _is_placed_otherwise(output, keys["capture"]) else "all"
 
 
 @contextmanager
@@ -164,27 +201,38 @@ def _is_finished(output: Path, key: str) -> bool:
     return (output / RECONSTRUCTION_FILE).is_file() and Workspace(output).is_done("placed", key)
 
 
-def _placed_before(output: Path, key: str) -> ReconstructionReport | None:
-    """The facts of a capture of the same photographs that was finished, and is to be placed otherwise."""
+def _is_placed_otherwise(output: Path, key: str) -> bool:
+    """Whether a capture of the same photographs was finished, and is to be placed anew."""
     finished = Workspace(output)
     is_capture = finished.is_done("capture", key) or finished.is_begun("capture", key)  # being placed anew
-    if not (is_capture and (output / RECONSTRUCTION_FILE).is_file() and (output / MAPPED).is_dir()):
-        return None
-    return read_reconstruction(output)
+    return is_capture and (output / MAPPED).is_dir() and read_reconstruction(output) is not None
+
+
+def _placed_again(prepared: ReconstructionPlan, before: ReconstructionReport) -> Georeferenced:
+    """The model of a finished capture where it belongs now. Nothing is written; raises CaptureError for positions,
+    distances and control points that are refused, and for a lens that these fit to none that there is."""
+    model = pycolmap.Reconstruction(prepared.request.output / MAPPED)
+    found = georeference(model, prepared, before.focal_fixed)
+    _lenses(found.model)
+    return found
 
 
 def _place_anew(
-    prepared: ReconstructionPlan, before: ReconstructionReport, keys: dict[str, str], console: Console
+    prepared: ReconstructionPlan,
+    before: ReconstructionReport,
+    found: Georeferenced,
+    keys: dict[str, str],
+    began: float,
+    console: Console,
 ) -> ReconstructionReport:
-    """Place the model of a finished capture again; it stays as it is where that is refused. Photographs are written
-    again only where what places it tells another lens, and where that was interrupted."""
-    began, collection = time.monotonic(), prepared.image_list
+    """Write where a finished capture lies now. Photographs are written again only where what places it tells another
+    lens, and where that was interrupted. `began`: when placing did, by the monotonic clock."""
+    collection = prepared.image_list
     output, photographs = prepared.request.output, collection.images
     kinds, finished = feature_extraction.group_by_camera(photographs), Workspace(output)
-    found = georeference(pycolmap.Reconstruction(output / MAPPED), prepared, before.focal_fixed)
     if not finished.is_done("capture", keys["capture"]) or _lens_moved(output, found.model):
         work = Workspace(output / WORK_FOLDER)
-        feature_extraction.write_upright_images(work, photographs)
+        feature_extraction.write_upright_images(work, photographs, prepared.threads)
         mask_files.write_upright_masks(work, photographs, prepared.threads)
         finished.begin("placed", keys["placed"])
         finished.begin("capture", keys["capture"])  # until all photographs are of this lens
@@ -259,9 +307,7 @@ def _finish(prepared: ReconstructionPlan, outcome: ReconstructionResult, key: st
     if outcome.metric is not None:
         write_json(output / "georef.json", _georef(facts, outcome.found.origin))
     size = request.options.max_output_size
-    pinholes = {
-        number: capture_writer.make_undistortion(lens, size).intrinsics for number, lens in _lenses(model).items()
-    }
+    pinholes = {number: capture_writer.straight_camera(lens, size) for number, lens in _lenses(model).items()}
     capture_writer.write_model(output, model, pinholes)
     write_json(
         output / RECONSTRUCTION_FILE,
@@ -280,7 +326,7 @@ def _features(
 ) -> list[ExcludedImage]:
     options, photographs = plan.request.options, plan.image_list.images
     feature_extraction.create_database(workspace, camera_groups)
-    failed = feature_extraction.prepare_images(workspace, photographs, console)
+    failed = feature_extraction.prepare_images(workspace, photographs, plan.threads, console)
     counts = feature_extraction.count_features(workspace)
     if not workspace.is_done("features", key):
         mask_files.write_upright_masks(workspace, photographs, plan.threads)
@@ -293,18 +339,19 @@ def _features(
 
 
 def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: Console) -> int:
+    """Match what may show the same; the number of pairs."""
+    if workspace.is_done("matches", key):  # to choose them again may last: by looks it takes all descriptors
+        return feature_matching.count_pairs(workspace)
     photographs = plan.image_list.images
     chosen = feature_matching.select_pairs(workspace, photographs, plan.gps_priors, plan.request.options)
     there = feature_extraction.count_features(workspace)
     chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]
-    if workspace.is_done("matches", key):
-        return len(chosen)
     if not workspace.is_begun("matches", key):
         feature_matching.delete_matches(workspace)
         workspace.begin("matches", key)
     feature_matching.match_pairs(workspace, chosen, plan.threads, console)
     workspace.finish("matches", key)
-    return len(chosen)
+    return feature_matching.count_pairs(workspace)
 
 
 def _mapped(
@@ -340,6 +387,7 @@ def _models(
         if not workspace.is_begun("model", key):
             workspace.forget("model", "joined", "rigs", "focal")  # before: what is done is read
             incremental_mapper.delete_models(workspace)
+            take_rigs_apart(workspace, plan.image_list.images)
             workspace.begin("model", key)
         incremental_mapper.run_mapper(workspace, count, fix_focal, plan.threads, console)
         workspace.finish("model", key)
@@ -412,10 +460,9 @@ def _write_images(
     names: dict[int, list[str]] = {}
     for image in sorted(capture_writer.placed_images(model), key=lambda image: image.name):
         names.setdefault(image.camera_id, []).append(image.name)
-    lenses = {number: capture_writer.make_undistortion(lens, max_size) for number, lens in _lenses(model).items()}
     total = sum(map(len, names.values()))
     with report_progress(work, console, "writing", total, "without distortion, ") as tell:
-        capture_writer.write_images(output, work, names, lenses, prepared.threads, tell)
+        capture_writer.write_images(output, work, names, _lenses(model), max_size, prepared.threads, tell)
 
 
 def _georef(report: ReconstructionReport, origin: tuple[float, float, float] | None) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def estimate_sfm(plan: ReconstructionPlan) -> SfmEstimate:
         workspace, before = Workspace(Path(folder)), Moment.now()
         groups = feature_extraction.group_by_camera(chosen)
         feature_extraction.create_database(workspace, groups)
-        feature_extraction.write_upright_images(workspace, chosen)
+        feature_extraction.write_upright_images(workspace, chosen, threads)
         mask_files.write_upright_masks(workspace, chosen, threads)
         feature_extraction.extract_groups(workspace, groups, plan.request.options, len(photographs), threads)
         searched = Moment.now()

@@ -6,6 +6,7 @@ from typing import Any
 
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_metadata import RADIAL
+from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import cache_key
 from vdgs.system.content_digests import ContentDigests
@@ -16,8 +17,9 @@ FORMAT = "0.1.0"
 
 
 def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, str]:
-    """What each step depends on, each on those before it. All but the last do not depend on what places the scene.
-    Raises CaptureError for a photograph that cannot be read."""
+    """What each step depends on, each on those before it. All but the last do not depend on what places the scene, but
+    models on whether it lets the focal length be held: work that goes on maps anew then, while finished captures are
+    placed anew. Raises CaptureError for a photograph that cannot be read."""
     options, positions = plan.request.options, plan.gps_priors
     content = digests.of_all(photo.path for photo in plan.image_list.images)
     if lost := [path for path, digest in content.items() if not digest]:
@@ -32,8 +34,9 @@ def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, st
         *_other_cameras(plan),
     )  # fmt: skip
     matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
-    mapped = cache_key(matched, options.focal)
-    capture = cache_key(mapped, options.max_output_size)
+    asked = cache_key(matched, options.focal)
+    mapped = cache_key(asked, should_fix_focal(plan.image_list.images, positions, options)[0])
+    capture = cache_key(asked, options.max_output_size)
     points, bars = plan.gcps.points if plan.gcps else (), plan.scale_bars
     told = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist(), positions.origin]
     known = [record_to_dict(point) for point in points], bars and record_to_dict(bars)

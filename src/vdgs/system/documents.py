@@ -84,6 +84,8 @@ class MeasuredAs(TypedDict, total=False):
     lpips_weights: str
     bins: int
     exposed: str | None
+    #: CRC-32 of the photographs, of those from where nobody flew.
+    photographs: int
 
 
 class StageStatusDocument(TypedDict):

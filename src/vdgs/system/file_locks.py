@@ -11,6 +11,8 @@ from pathlib import Path
 from vdgs.errors import RunError
 from vdgs.system.atomic_files import disk_hint
 
+#: The file in a folder that is locked.
+LOCK_FILE = ".lock"
 #: Attempts to take a lock, and seconds between them: `is_locked` holds it too, for a moment.
 LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
 
@@ -19,7 +21,7 @@ def is_locked(folder: Path) -> bool:
     """Whether a process holds the exclusive lock of a folder. Creates nothing. Raises OSError where the file system has
     no locks."""
     try:
-        handle = (folder / ".lock").open("rb")
+        handle = (folder / LOCK_FILE).open("rb")
     except OSError:
         return False
     with handle:
@@ -46,7 +48,7 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # For reading and writing: NFS needs the one for shared locks and the other for exclusive ones.
-        handle = (folder / ".lock").open("a+b")
+        handle = (folder / LOCK_FILE).open("a+b")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror}). {disk_hint(error)}.") from error
     with handle:

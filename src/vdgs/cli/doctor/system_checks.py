@@ -21,7 +21,7 @@ from typing import Any
 from vdgs.cli.doctor import SystemCheck
 from vdgs.kernels import cpu_count
 from vdgs.system.broken_packages import import_reason, reinstall_command
-from vdgs.system.cgroups import cgroup_limits
+from vdgs.system.cgroups import cgroup_limits, slurm_memory_limit
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES
 from vdgs.system.stop_signals import preserve_signal_handlers
 from vdgs.system.units import data_size
@@ -123,11 +123,14 @@ def _threads() -> list[SystemCheck]:
 def _memory() -> list[SystemCheck]:
     import psutil
 
-    groups, memory = cgroup_limits(), psutil.virtual_memory()
-    total = min([memory.total, *(group.limit for group in groups)])
-    free = min([memory.available, *(group.free for group in groups)])
+    from vdgs.system.memory.process_memory import available_memory_bytes
+
+    groups, memory, job = cgroup_limits(), psutil.virtual_memory(), slurm_memory_limit()
+    total, free = min([memory.total, *(group.limit for group in groups)]), available_memory_bytes()
+    by = "by a control group (container, SLURM job, systemd unit)"
+    if total == memory.total and job is not None:  # as `available_memory_bytes` counts it
+        total, by = min(total, job), "by what the SLURM job asked for"
     if total < memory.total:
-        by = "by a control group (container, SLURM job, systemd unit)"
         return [SystemCheck("memory", "ok", f"{data_size(free)} free, limited to {data_size(total)} {by}")]
     return [SystemCheck("memory", "ok", f"{data_size(free)} free of {data_size(total)}")]
 

@@ -63,15 +63,24 @@ class FilmRecord:
 
 @contextmanager
 def temporary_frames(request: SfmRequest, console: Console) -> Iterator[SfmRequest]:
-    """The request with frames in place of films, for a look that writes nothing into the output.
+    """The request with frames in place of films, for a look that writes nothing into the output: those that were taken
+    before, where they are of these films.
 
-    Raises CaptureError for films that cannot be read or show no way, VdgsError for an output that is something else.
+    Raises CaptureError for films that cannot be read or show no way, VdgsError for an output that is something else, or
+    was begun with other films.
     """
-    if not films_in(request.image_folders):
+    films = films_in(request.image_folders)
+    if not films:
         yield request
         return
     check_output(request.output)
     check_output_folder(request.output)  # before the frames are taken, which lasts
+    digests = read_digests(request.output)
+    if (request.output / SOURCE_IMAGES_FILE).exists() and not request.overwrite:
+        _check_same(request, films, digests)
+    if _are_taken(request, films, digests):
+        yield replace(request, image_folders=_with_folder(request, request.output / FRAMES_FOLDER))
+        return
     with tempfile.TemporaryDirectory(prefix="vdgs-frames-") as folder:
         yield replace(request, image_folders=_take(request, Path(folder), console))
 
@@ -172,13 +181,30 @@ def _take(
     if digests is not None:
         digests.write()
     count = sum(record.frames for record in records.values())
-    others = tuple(path for path in request.image_folders if not films_in((path,)))
-    if count < MIN_IMAGES and not others:
+    folders = _with_folder(request, folder)
+    if count < MIN_IMAGES and folders == (folder,):
         raise CaptureError(
             f"{', '.join(map(str, films))}: {count} frames that differ from each other; a scene needs {MIN_IMAGES} at "
             "the very least. The picture must move: films from one spot show no place from different sides."
         )
-    return (*others, folder)
+    return folders
+
+
+def _with_folder(request: SfmRequest, frames: Path) -> tuple[Path, ...]:
+    """The folders of photographs, and that of frames in place of the films."""
+    return (*(path for path in request.image_folders if not films_in((path,))), frames)
+
+
+def _are_taken(request: SfmRequest, films: Sequence[Path], digests: ContentDigests) -> bool:
+    """Whether the output holds all frames of these films."""
+    before = _records(request.output)
+    if not before:  # no need to read the films
+        return False
+    content, most = digests.of_all(films), _bounds(films, request.options.num_frames)
+    return all(
+        name in before and (request.output / FRAMES_FOLDER / name).is_dir() and before[name].is_of(film, content, bound)
+        for name, film, bound in zip(_folder_names(films), films, most, strict=True)
+    )
 
 
 def _write_records(output: Path, records: Mapping[str, FilmRecord]) -> None:
