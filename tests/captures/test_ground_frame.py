@@ -113,13 +113,16 @@ def test_up_contradicts_a_georeference_that_is_asked_for(tmp_path):
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-3))
 @example([0.0, 1e-05, -1.0])
+@example([0.0, 1e-6, -1.0])
+@example([1e-8, 0.0, -1.0])
 @example([0.0, 0.0, -1.0])
 @example([1e-170, 0.0, -1.0])
 def test_the_smallest_rotation_to_z(vector):
     unit = np.array(vector) / np.linalg.norm(vector)
     rotation = rotation_to_z(unit)
-    np.testing.assert_allclose(rotation @ unit, [0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(rotation @ unit, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.trace(rotation) == pytest.approx(1 + 2 * unit[2], abs=1e-12)  # by the angle to z and no more
 
 
 # ------------------------------------------------------------------------------------- georeferences
