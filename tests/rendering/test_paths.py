@@ -367,7 +367,8 @@ def test_an_orbit_looks_at_the_scene_from_where_the_flight_was():
 
 
 def test_an_orbit_has_two_thirds_of_the_reach_of_the_flight_and_no_seam():
-    """Along and across a flight that is longer than wide; the turn from the last frame to the first is as the others."""
+    """Along and across a flight that is longer than wide; the last frame is as far from the first as from its other
+    neighbor."""
     cameras = strips(rows=4, columns=20)
     center = np.array([38.0, 18.0, 0.0])
     path = orbit(center[None], cameras, TEMPLATE, seconds=4.0, fps=25.0)
