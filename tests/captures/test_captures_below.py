@@ -15,6 +15,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import model_below
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
 
 
 def follow(said: str | None) -> tuple[Path, CaptureOptions]:
@@ -47,7 +48,9 @@ def test_a_model_is_never_given_the_photographs_of_another(tmp_path, scene):
     write_city_gaussian(tmp_path, scene)
     shutil.rmtree(tmp_path / "train/block_all/input")
     said = model_below(tmp_path)
-    assert f"put them beside it as images: vdgs run {tmp_path}/train/block_all --output RUN" in str(said)
+    assert f"put them beside it as images: vdgs run {shell_word(tmp_path / 'train/block_all')} --output RUN" in str(
+        said
+    )
 
 
 @pytest.mark.parametrize("sides", [("zz", "aa"), ("train/zz", "test/aa")])

@@ -20,6 +20,7 @@ from vdgs.captures.output_guard import is_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import collect_images, is_image_folder
+from vdgs.system.quoting import shell_word
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def test_captures_below_are_named_before_poses_are_made_anew(tmp_path, scene, be
     write_colmap(tmp_path / below, scene, images=images, sparse=sparse)
     write_images(tmp_path / "input", scene)
     assert is_image_folder(tmp_path)
-    said = re.escape(f"{below} is a capture: vdgs run {tmp_path / below}")
+    said = re.escape(f"{below} is a capture: vdgs run {shell_word(tmp_path / below)}")
     for refuses in (lambda: collect_images([tmp_path]), lambda: load_capture(tmp_path)):
         with pytest.raises(CaptureError, match=said):
             refuses()
@@ -283,7 +284,7 @@ def test_the_only_place_of_photographs_beside_a_model_is_used(tmp_path, scene, f
 
 def test_a_model_alone_names_the_folder_that_has_its_photographs(tmp_path, scene):
     folder = write_colmap(tmp_path, scene)
-    with pytest.raises(CaptureError, match=rf"is a model alone.* Give the folder of both: {tmp_path}"):
+    with pytest.raises(CaptureError, match=rf"is a model alone.* Give the folder of both: {re.escape(str(tmp_path))}"):
         load_capture(folder)
 
 
@@ -304,7 +305,9 @@ def test_points_come_from_a_cloud_beside_the_model(tmp_path, scene, cloud, text)
     with pytest.raises(CaptureError, match=r"no 3D points(?s:.)*points3D\.ply"):
         load_capture(tmp_path)
     (tmp_path / "photographs").symlink_to(tmp_path / "images")
-    with pytest.raises(CaptureError, match=f"vdgs sfm {tmp_path} --images photographs --output CAPTURE"):
+    with pytest.raises(
+        CaptureError, match=re.escape(f"vdgs sfm {shell_word(tmp_path)} --images photographs --output CAPTURE")
+    ):
         load_capture(tmp_path, CaptureOptions(images="photographs"))
     write_ply(tmp_path / cloud, scene.points, scene.colors)
     capture = load_capture(tmp_path)
@@ -376,10 +379,12 @@ def test_a_part_of_a_capture_names_the_folder_of_it_all(tmp_path, scene):
     parts = ["model/sparse/0/images.bin", "model/sparse/0/points3D.bin", "set/transforms_train.json"]
     for part in parts:
         root = tmp_path / part.split("/")[0]
-        with pytest.raises(CaptureError, match=rf"is a part of a capture\. Give the folder of it all: {root}$"):
+        with pytest.raises(
+            CaptureError, match=rf"is a part of a capture\. Give the folder of it all: {re.escape(str(root))}$"
+        ):
             load_capture(tmp_path / part)
         assert len(load_capture(root, CaptureOptions(up="z")).views) >= len(scene.cameras)
-        with pytest.raises(CaptureError, match=rf"Give the folder of it all: {root}$"):
+        with pytest.raises(CaptureError, match=rf"Give the folder of it all: {re.escape(str(root))}$"):
             collect_images([tmp_path / part])
 
 

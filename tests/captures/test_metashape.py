@@ -435,7 +435,9 @@ def test_of_two_photographs_the_one_as_large_as_the_camera_is_taken(tmp_path, co
         copy = tmp_path / name.replace(*copied)
         copy.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (64, 48)).save(copy)
-    with pytest.raises(CaptureError, match=rf"8 of its 8 names .*: DCIM\S* or \S*{copied[1]}.*Of these {remedy}"):
+    with pytest.raises(
+        CaptureError, match=rf"8 of its 8 names .*: DCIM\S* or \S*{re.escape(copied[1])}.*Of these {remedy}"
+    ):
         read(tmp_path, metashape_xml(flight), flight)
     Image.new("L", SIZE).save(tmp_path / flight.names[0])
     for name in flight.names[1:]:

@@ -104,7 +104,7 @@ def test_a_whole_run_is_whole(run, capsys):
     said = capsys.readouterr().out
     assert "10 done" in said
     assert f"report: {run.path / 'report.html'}" in said
-    assert next_commands(said) == [f"vdgs view {run.path}"]
+    assert next_commands(said) == [f"vdgs view {shlex.quote(str(run.path))}"]
 
 
 @pytest.mark.parametrize(
@@ -272,7 +272,7 @@ def test_the_model_that_is_opened_says_what_it_is(run, opened_without_photograph
     opened = open_run(run.path)
     assert opened.name == "coarse"
     assert f"this is the coarse model, not the merged one: there is one that was {OTHER_SETTINGS}" in opened.warning
-    assert f"vdgs partition {run.path}" in opened.warning
+    assert f"vdgs partition {shlex.quote(str(run.path))}" in opened.warning
     assert open_run(run.path, "coarse").warning == ""  # as was asked for
     with pytest.raises(RunError, match=f"no merged model of its settings yet .*{OTHER_SETTINGS}.*vdgs partition"):
         open_run(run.path, "merged")
@@ -286,7 +286,7 @@ def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_wit
     opened = open_run(run.path)
     assert opened.name == "merged"
     assert OTHER_BLOCKS in opened.warning
-    assert f"vdgs merge {run.path}" in opened.warning
+    assert f"vdgs merge {shlex.quote(str(run.path))}" in opened.warning
 
 
 def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
@@ -295,7 +295,7 @@ def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(
     other = replace(run.settings(), merge=MergeConfig("max-visibility"))
     run.change_settings(other, overwrite=True)
     assert run.config.command() is None
-    assert get_run_status(run).next_command() == f"vdgs merge {run.path}"
+    assert get_run_status(run).next_command() == f"vdgs merge {shlex.quote(str(run.path))}"
     run.change_settings(replace(run.settings(), merge=MergeConfig()), overwrite=True, command="vdgs run anew")
     assert get_run_status(run).next_command() == "vdgs run anew"
 
