@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 
+from support.advice import advised_words
 from support.captures import TinyScene, write_colmap, write_images
 from support.dataset_layouts import halves, write_matrixcity, write_transforms
 from vdgs.captures.loading import load_capture
@@ -20,9 +20,8 @@ from vdgs.system.quoting import shell_word
 
 def follow(said: str | None) -> tuple[Path, CaptureOptions]:
     """What the command in a message gives to vdgs."""
-    command = re.search(r"vdgs run (\S+)(?: --images (\S+))? --output RUN", said or "")
-    assert command is not None
-    return Path(command[1]), CaptureOptions(images=command[2], up="z")
+    capture, images = advised_words("vdgs run WORD(?: --images WORD)? --output RUN", said or "")
+    return Path(capture), CaptureOptions(images=images, up="z")
 
 
 def write_city_gaussian(
