@@ -408,7 +408,7 @@ def test_the_geometric_median_turns_with_its_points():
 @pytest.mark.parametrize(("name", "degrees"), [("brighton", 2.0), ("copr", 5.0), ("seneca", 1.0)])
 def test_on_real_flights_the_estimate_agrees_with_the_georeference(name, degrees):
     """The real captures are in ENU; the estimate, told nothing, must find z (nadir flights included)."""
-    folder = data_folder(name)
+    folder = data_folder(name, "images_4", "georef.json")
     capture = load_capture(folder, CaptureOptions(images="images_4"))
     assert capture.ground.metric
     source = SourceCapture(
@@ -431,7 +431,7 @@ def test_on_real_flights_the_estimate_agrees_with_the_georeference(name, degrees
 
 @pytest.mark.capture
 def test_real_gps_agrees_with_the_georeference():
-    folder = data_folder("seneca")
+    folder = data_folder("seneca", "images_4", "georef.json", "gps.csv")
     capture = load_capture(folder, CaptureOptions(images="images_4"))
     by_gps = load_capture(folder, CaptureOptions(images="images_4", gps=folder / "gps.csv"))
     assert by_gps.ground.scale == pytest.approx(1, abs=1e-3)
