@@ -16,6 +16,7 @@ from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
 
 Change = Callable[[dict], None]
 
@@ -152,7 +153,7 @@ def test_transparency_of_a_set_with_points_is_said(tmp_path, both):
             transparent = photograph.convert("RGBA")
         transparent.save(image)
     (note,) = [note for note in load_capture(tmp_path).warnings if "transparent" in note]
-    assert f"vdgs sfm {tmp_path} --output CAPTURE makes it white" in note
+    assert f"vdgs sfm {shell_word(tmp_path)} --output CAPTURE makes it white" in note
 
 
 def test_masks_that_frames_name_are_used(tmp_path, both):

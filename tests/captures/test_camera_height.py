@@ -71,7 +71,7 @@ def test_of_a_flight_it_is_the_height_above_the_median_point_to_the_last_bit(alt
 @pytest.mark.capture
 @pytest.mark.parametrize("name", ["brighton", "copr", "seneca"])
 def test_of_a_real_flight_too(name):
-    capture = load_capture(data_folder(name), CaptureOptions(images="images_4"))
+    capture = load_capture(data_folder(name, "images_4"), CaptureOptions(images="images_4"))
     assert camera_height(capture) == plain_height(capture)
 
 

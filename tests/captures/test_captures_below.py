@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 
+from support.advice import advised_words
 from support.captures import TinyScene, write_colmap, write_images
 from support.dataset_layouts import halves, write_matrixcity, write_transforms
 from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import model_below
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
 
 
 def follow(said: str | None) -> tuple[Path, CaptureOptions]:
     """What the command in a message gives to vdgs."""
-    command = re.search(r"vdgs run (\S+)(?: --images (\S+))? --output RUN", said or "")
-    assert command is not None
-    return Path(command[1]), CaptureOptions(images=command[2], up="z")
+    capture, images = advised_words("vdgs run WORD(?: --images WORD)? --output RUN", said or "")
+    return Path(capture), CaptureOptions(images=images, up="z")
 
 
 def write_city_gaussian(
@@ -47,7 +47,9 @@ def test_a_model_is_never_given_the_photographs_of_another(tmp_path, scene):
     write_city_gaussian(tmp_path, scene)
     shutil.rmtree(tmp_path / "train/block_all/input")
     said = model_below(tmp_path)
-    assert f"put them beside it as images: vdgs run {tmp_path}/train/block_all --output RUN" in str(said)
+    assert f"put them beside it as images: vdgs run {shell_word(tmp_path / 'train/block_all')} --output RUN" in str(
+        said
+    )
 
 
 @pytest.mark.parametrize("sides", [("zz", "aa"), ("train/zz", "test/aa")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from support.dataset_layouts import (
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.quoting import shell_word
 
 # -------------------------------------------------------------------------------------------- Mega-NeRF
 
@@ -170,7 +172,9 @@ def test_matrixcity_blocks(tmp_path, scene):
     both |= {f"test/block_1_test/rgb/{n}": c for n, c in test.cameras.items()}
     assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colors))
     np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
-    with pytest.raises(CaptureError, match=rf"is one block of MatrixCity\..* above train/: {tmp_path}$"):
+    with pytest.raises(
+        CaptureError, match=rf"is one block of MatrixCity\..* above train/: {re.escape(shell_word(tmp_path))}$"
+    ):
         load_capture(tmp_path / "train/block_1")
     with pytest.raises(CaptureError, match=r"is one block of MatrixCity\..* above train/: CITY, with it as CITY/train"):
         load_capture(tmp_path / "test/block_1_test")

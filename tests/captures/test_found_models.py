@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from support.advice import advised_words
 from support.captures import TinyScene, tiny_scene, write_colmap, write_images, write_ply
 from support.dataset_layouts import DRB, OPENGL, halves, write_blender, write_matrixcity, write_mega_nerf
 from vdgs.captures.format_dispatch import lacks_points
@@ -20,6 +21,7 @@ from vdgs.captures.output_guard import is_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import collect_images, is_image_folder
+from vdgs.system.quoting import shell_word
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +92,7 @@ def test_captures_below_are_named_before_poses_are_made_anew(tmp_path, scene, be
     write_colmap(tmp_path / below, scene, images=images, sparse=sparse)
     write_images(tmp_path / "input", scene)
     assert is_image_folder(tmp_path)
-    said = re.escape(f"{below} is a capture: vdgs run {tmp_path / below}")
+    said = re.escape(f"{below} is a capture: vdgs run {shell_word(tmp_path / below)}")
     for refuses in (lambda: collect_images([tmp_path]), lambda: load_capture(tmp_path)):
         with pytest.raises(CaptureError, match=said):
             refuses()
@@ -110,10 +112,9 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
     write_colmap(tmp_path, scene, images=None, sparse=sparse)
     with pytest.raises(CaptureError, match=r"is a COLMAP model of 12 photographs") as refused:
         collect_images([tmp_path])
-    link = re.search(r"ln -s (\S+) (\S+); vdgs run (\S+) --output RUN", str(refused.value))
-    assert link is not None
-    Path(link[2]).symlink_to(link[1])
-    assert len(load_capture(Path(link[3])).views) == 12
+    target, link, capture = advised_words(r"ln -s WORD WORD; vdgs run WORD --output RUN", str(refused.value))
+    Path(link).symlink_to(target)
+    assert len(load_capture(Path(capture)).views) == 12
 
 
 @pytest.mark.parametrize(
@@ -209,9 +210,8 @@ def test_a_capture_below_whose_photographs_lie_beside_it_is_named_with_them(tmp_
     (tmp_path / "nerf" / "images").rename(tmp_path / "photographs")
     with pytest.raises(CaptureError, match="nerf is a capture") as refused:
         load_capture(tmp_path)
-    command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", str(refused.value))
-    assert command is not None
-    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
+    capture, images = advised_words("vdgs run WORD --images WORD --output RUN", str(refused.value))
+    assert len(load_capture(Path(capture), CaptureOptions(images=images)).views) == 12
 
 
 @pytest.mark.parametrize("images", ["images/dslr_images_undistorted", "datasets/place/mapping"])
@@ -222,10 +222,9 @@ def test_a_model_whose_photographs_lie_deep_beside_it_is_named_with_them(tmp_pat
     write_images(tmp_path / "masks", scene)
     with pytest.raises(CaptureError, match=r"calibration is a COLMAP model of 12 photographs") as refused:
         load_capture(tmp_path)
-    link = re.search(r"ln -s (\S+) (\S+); vdgs run (\S+) --output RUN", str(refused.value))
-    assert link is not None
-    Path(link[2]).symlink_to(link[1])
-    assert len(load_capture(Path(link[3])).views) == 12
+    target, link, capture = advised_words(r"ln -s WORD WORD; vdgs run WORD --output RUN", str(refused.value))
+    Path(link).symlink_to(target)
+    assert len(load_capture(Path(capture)).views) == 12
 
 
 def test_a_model_alone_that_is_none_of_the_folder_above_names_the_photographs(tmp_path, scene):
@@ -233,9 +232,8 @@ def test_a_model_alone_that_is_none_of_the_folder_above_names_the_photographs(tm
     write_colmap(tmp_path, scene, images=None, sparse="calibration")
     with pytest.raises(CaptureError, match="is a model alone") as refused:
         load_capture(tmp_path / "calibration")
-    command = re.search(r"vdgs run (\S+) --images (\S+)$", str(refused.value))
-    assert command is not None
-    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
+    capture, images = advised_words("vdgs run WORD --images WORD$", str(refused.value))
+    assert len(load_capture(Path(capture), CaptureOptions(images=images)).views) == 12
 
 
 def test_photographs_beside_a_capture_are_found_at_its_own_level(tmp_path, scene):
@@ -244,9 +242,8 @@ def test_photographs_beside_a_capture_are_found_at_its_own_level(tmp_path, scene
     (tmp_path / "dslr/nerfstudio/images").rename(tmp_path / "dslr/resized_images")
     with pytest.raises(CaptureError, match="nerfstudio is a capture") as refused:
         load_capture(tmp_path)
-    command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", str(refused.value))
-    assert command is not None
-    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2])).views) == 12
+    capture, images = advised_words("vdgs run WORD --images WORD --output RUN", str(refused.value))
+    assert len(load_capture(Path(capture), CaptureOptions(images=images)).views) == 12
 
 
 def test_captures_beside_the_one_that_is_named_are_said(tmp_path, scene):
@@ -263,7 +260,7 @@ def test_registered_cameras_of_realityscan_are_told_from_tables(tmp_path):
     (tmp_path / "poses").mkdir()
     table = tmp_path / "poses" / "out.csv"
     table.write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\nframe_000.png,1,2,3,0,0,0,30,0,0\n")
-    with pytest.raises(CaptureError, match=r"out\.csv is a project of RealityScan: vdgs run .*out\.csv --images"):
+    with pytest.raises(CaptureError, match=r"out\.csv is a project of RealityScan: vdgs run .*out\.csv'? --images"):
         collect_images([tmp_path])
     table.rename(tmp_path / "out.csv")
     assert is_capture(tmp_path)
@@ -283,7 +280,9 @@ def test_the_only_place_of_photographs_beside_a_model_is_used(tmp_path, scene, f
 
 def test_a_model_alone_names_the_folder_that_has_its_photographs(tmp_path, scene):
     folder = write_colmap(tmp_path, scene)
-    with pytest.raises(CaptureError, match=rf"is a model alone.* Give the folder of both: {tmp_path}"):
+    with pytest.raises(
+        CaptureError, match=rf"is a model alone.* Give the folder of both: {re.escape(shell_word(tmp_path))}"
+    ):
         load_capture(folder)
 
 
@@ -304,7 +303,9 @@ def test_points_come_from_a_cloud_beside_the_model(tmp_path, scene, cloud, text)
     with pytest.raises(CaptureError, match=r"no 3D points(?s:.)*points3D\.ply"):
         load_capture(tmp_path)
     (tmp_path / "photographs").symlink_to(tmp_path / "images")
-    with pytest.raises(CaptureError, match=f"vdgs sfm {tmp_path} --images photographs --output CAPTURE"):
+    with pytest.raises(
+        CaptureError, match=re.escape(f"vdgs sfm {shell_word(tmp_path)} --images photographs --output CAPTURE")
+    ):
         load_capture(tmp_path, CaptureOptions(images="photographs"))
     write_ply(tmp_path / cloud, scene.points, scene.colors)
     capture = load_capture(tmp_path)
@@ -376,10 +377,12 @@ def test_a_part_of_a_capture_names_the_folder_of_it_all(tmp_path, scene):
     parts = ["model/sparse/0/images.bin", "model/sparse/0/points3D.bin", "set/transforms_train.json"]
     for part in parts:
         root = tmp_path / part.split("/")[0]
-        with pytest.raises(CaptureError, match=rf"is a part of a capture\. Give the folder of it all: {root}$"):
+        with pytest.raises(
+            CaptureError, match=rf"is a part of a capture\. Give the folder of it all: {re.escape(shell_word(root))}$"
+        ):
             load_capture(tmp_path / part)
         assert len(load_capture(root, CaptureOptions(up="z")).views) >= len(scene.cameras)
-        with pytest.raises(CaptureError, match=rf"Give the folder of it all: {root}$"):
+        with pytest.raises(CaptureError, match=rf"Give the folder of it all: {re.escape(shell_word(root))}$"):
             collect_images([tmp_path / part])
 
 

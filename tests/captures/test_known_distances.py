@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from support.captures import tiny_scene, write_colmap
+from vdgs.captures.known_distances import LEAST_SHARE, LocatedPoint, scale_of_distances
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -69,6 +70,42 @@ def test_a_georeference_keeps_its_place_and_takes_the_scale_unless_that_contradi
     assert np.median(after.points, axis=0) == pytest.approx(np.median(before.points, axis=0), abs=0.02)
     with pytest.raises(CaptureError, match=r"times as large.*feet"):
         load_capture(capture, CaptureOptions(scale_bar=bars(tmp_path / "bars.txt", length / 0.3048)))
+
+
+def located(**places: float) -> dict[str, LocatedPoint]:
+    """Points on a line, in units of the world, whose marks are off by 5 pixels."""
+    return {name: LocatedPoint(np.array([x, 0.0, 0.0]), 5.0) for name, x in places.items()}
+
+
+@pytest.mark.parametrize("length", [10.0, 100.0])
+def test_two_distances_that_differ_are_as_far_from_their_mean(length):
+    points = located(A=0.0, B=length, C=0.0, D=length)
+    scale, share = scale_of_distances([("A", "B", 0.98 * length), ("C", "D", 1.02 * length)], points, 0.001, "bars")
+    assert scale == pytest.approx((0.98 * 1.02) ** 0.5)
+    assert share == pytest.approx(0.01, rel=0.03)  # half of what the farther is from the mean
+
+
+def test_distances_count_by_what_their_marks_leave_in_doubt():
+    """Pixels of 1 cm, marks off by 7: a share of 0.7 % in 10 units, and of 0.07 % in 100 beside 0.2 % of the tape."""
+    points = located(A=0.0, B=100.0, C=0.0, D=10.0)
+    scale, share = scale_of_distances([("A", "B", 100.0), ("C", "D", 10.1)], points, 0.01, "bars")
+    doubts = np.hypot(LEAST_SHARE, 0.05 * 2**0.5 / np.array([100.0, 10.0]))
+    weights = doubts**-2 / (doubts**-2).sum()
+    assert scale == pytest.approx(1.01 ** weights[1], rel=1e-9)
+    assert 1 < scale < 1.001
+    alone, doubt = scale_of_distances([("A", "B", 100.0)], points, 0.01, "bars")
+    assert (alone, doubt) == (pytest.approx(1.0), pytest.approx(doubts[0]))
+    assert share == pytest.approx(abs(1.01 / scale - 1) / 2)
+
+
+def test_marks_that_meet_behind_the_cameras_mark_no_point(capture, tmp_path):
+    behind = np.array([0.0, 0.0, 500.0])
+    seen = [each for each in tiny_scene().cameras.items() if each[1].project(behind[None])[1][0] < 0]
+    lines = [mark("ray", "A", behind, *each) for each in seen[:4]]
+    file = bars(tmp_path / "bars.txt")
+    file.write_text("\n".join([*lines, *(line for line in file.read_text().splitlines() if line[:5] != "A ray")]))
+    with pytest.raises(CaptureError, match="the point A is not shown by two placed photographs that agree"):
+        load_capture(capture, CaptureOptions(up="z", scale_bar=file))
 
 
 @pytest.mark.parametrize(

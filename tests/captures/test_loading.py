@@ -436,7 +436,7 @@ def test_a_map_takes_little_more_memory_than_itself():
     ("brighton", 3, 15, 20512), ("copr", 5, 33, 47015), ("seneca", 21, 145, 102770),
 ])  # fmt: skip
 def test_real_captures_load_whole(name, test, train, points):
-    capture = load_capture(data_folder(name), CaptureOptions(images="images_4"))
+    capture = load_capture(data_folder(name, "images_4"), CaptureOptions(images="images_4"))
     assert (len(capture.test_views), len(capture.train_views), len(capture.points)) == (test, train, points)
     assert capture.warnings == ()
     assert capture.ground.metric

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -203,7 +204,7 @@ def test_a_few_pictures_are_no_photographs(tmp_path: Path) -> None:
 def test_all_that_a_camera_took_is_one_tree(tmp_path: Path) -> None:
     photographs(tmp_path / "DCIM" / "100MEDIA", 1)
     for inside in ("DCIM", "DCIM/run", "DCIM/100MEDIA/x", "DCIM/101MEDIA"):
-        with pytest.raises(VdgsError, match=str(tmp_path / "(DCIM-results|run|x|101MEDIA)$")):
+        with pytest.raises(VdgsError, match=re.escape(f"{tmp_path}/") + "(DCIM-results|run|x|101MEDIA)$"):
             check_output(tmp_path / inside)
     assert not is_refused(tmp_path / "other" / "DCIM")  # not there yet
 

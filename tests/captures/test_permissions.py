@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.image_metadata import UnusableImage, read_image_metadata
 from vdgs.system.exit_codes import exit_code_of
 from vdgs.system.permissions import barred_by
+from vdgs.system.quoting import shell_word
 
 NOBODY = 65534
 
@@ -28,11 +28,14 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "setresuid"), reason="other user
 @pytest.fixture
 def folder() -> Iterator[Path]:
     """A folder of photographs, one of them below another folder, and a process that may not do all."""
+    users, is_root = os.getresuid(), os.geteuid() == 0
     with tempfile.TemporaryDirectory() as made:
-        here = Path(made) / "photographs"
-        shutil.copytree(_photographs(Path(made) / "first"), here)
-        Path(made).chmod(0o755)
-        users, is_root = os.getresuid(), os.geteuid() == 0
+        around = [Path(made).resolve(), *Path(made).resolve().parents]
+        if is_root and not all(each.stat().st_mode & 0o001 for each in around[1:]):
+            pytest.skip(f"other users may not enter a folder around {made} (set TMPDIR to one that they may)")
+        here = _photographs(Path(made) / "photographs")
+        for each in (Path(made), here, *here.rglob("*")):  # whatever the umask
+            each.chmod(0o755 if each.is_dir() else 0o644)
         if is_root:
             os.setresuid(NOBODY, NOBODY, 0)
         yield here
@@ -61,7 +64,7 @@ def set_mode(path: Path, mode: int) -> None:
 def test_a_photograph_that_may_not_be_read_is_not_taken_for_a_damaged_one(folder: Path, read: Callable[[Path], object]):
     photograph = folder / "a.jpg"
     set_mode(photograph, 0)
-    said = f"{photograph}: cannot be read (Permission denied). Allow it: chmod +r {photograph}"
+    said = f"{photograph}: cannot be read (Permission denied). Allow it: chmod +r {shell_word(photograph)}"
     with pytest.raises(CaptureError, match=f"^{re.escape(said)}$"):
         read(photograph)
 
@@ -69,15 +72,16 @@ def test_a_photograph_that_may_not_be_read_is_not_taken_for_a_damaged_one(folder
 def test_the_reconstruction_says_the_same(folder: Path):
     photograph = folder / "a.jpg"
     set_mode(photograph, 0)
-    with pytest.raises(UnusableImage, match=re.escape(f"chmod +r {photograph}")):
+    with pytest.raises(UnusableImage, match=re.escape(f"chmod +r {shell_word(photograph)}")):
         read_image_metadata(photograph, "a.jpg")
 
 
 @pytest.mark.parametrize("mode", [0o700, 0o711, 0o744, 0])
 def test_a_folder_that_may_not_be_read_is_named_not_a_file_in_it(folder: Path, mode: int):
     set_mode(folder / "sub", mode & ~0o700 if os.getuid() != NOBODY else mode)
-    said = rf"{folder}/sub: the folder cannot be read \(Permission denied\)\. Allow it: chmod \+rx {folder}/sub"
-    with pytest.raises(CaptureError, match=said):
+    closed = folder / "sub"
+    said = f"{closed}: the folder cannot be read (Permission denied). Allow it: chmod +rx {shell_word(closed)}"
+    with pytest.raises(CaptureError, match=re.escape(said)):
         list(walk(folder))
 
 

@@ -22,6 +22,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_enu
 from vdgs.runs.run_settings import with_absolute_paths
+from vdgs.system.quoting import shell_word
 
 WIDTH, HEIGHT = 96, 72
 LENS = brown_intrinsics((90.5, 90.0), (49.0, 35.5), (WIDTH, HEIGHT), (-0.06, 0.01, -0.01, 0.01), (0.001, -0.002), 0.3)
@@ -159,7 +160,9 @@ def test_a_project_below_is_named_with_the_command_that_reads_it(tmp_path, scene
     write_project(tmp_path / "export", scene, tmp_path / "my photos")
     said = model_below(tmp_path)
     assert said is not None
-    assert f"vdgs run {tmp_path}/export/cameras.xml --images {tmp_path} --output RUN" in said
+    assert (
+        f"vdgs run {shell_word(tmp_path / 'export/cameras.xml')} --images {shell_word(tmp_path)} --output RUN" in said
+    )
     capture = load_capture(tmp_path / "export" / "cameras.xml", CaptureOptions(images=str(tmp_path)))
     assert_true_pictures(capture, scene)
 

@@ -164,6 +164,9 @@ def test_views_by_visibility():
     assert [(each["lower"], each["upper"]) for each in bins] == [(1.0, 1.0), (3.0, 5.0)]
     assert all(each["lpips_vgg"] is None for each in bins)
     assert quantile_groups(np.array([], dtype=int), 3) == []
+    # A class belongs to the share that holds its middle member: that of 4, 4 and 2 are the 2nd, 6th and 9th of 10.
+    assert [group.tolist() for group in quantile_groups(np.array([4, 4, 2]), 2)] == [[0], [1, 2]]
+    assert [group.tolist() for group in quantile_groups(np.array([8, 1, 1]), 2)] == [[0], [1, 2]]
 
 
 @pytest.mark.capture

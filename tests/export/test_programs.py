@@ -122,6 +122,33 @@ def test_a_compressed_ply_holds_the_scene(tmp_path, count: int, degree: int):
     assert psnr(picture(back), picture(some)) > (30 if degree else 34)
 
 
+def test_a_compressed_ply_rounds_by_half_a_step_and_no_more(tmp_path):
+    """One chunk: steps are a 2047th or 1023rd of what it spans; of coefficients, a 256th of -4 .. 4, cut off beyond."""
+    some = random_gaussians(250, 1)
+    wide = np.random.default_rng(0).uniform(-4, 4, some.shN.shape)
+    wide[:20] = np.sign(wide[:20]) * 9.0
+    some = replace(some, shN=torch.from_numpy(wide.astype(np.float32)))
+    (down,) = (axes for axes in ALL if axes.name == "y-down")
+    written = down.of_ground(some)
+    registry.write_scene(tmp_path / "a.compressed.ply", ExportScene.of(some))
+    read = down.of_ground(registry.read_gaussians(tmp_path / "a.compressed.ply"))
+    read = read.select(torch.cdist(written.means, read.means).argmin(1))  # in Morton order
+    steps = np.array([2047, 1023, 2047])
+    for name in ("means", "log_scales"):
+        wanted = written.tensors()[name].double().numpy()
+        off = np.abs(read.tensors()[name].double().numpy() - wanted)
+        assert (off <= 0.501 * np.ptp(wanted, axis=0) / steps + 1e-6).all(), name
+    np.testing.assert_allclose(base_colors(read), base_colors(written), atol=np.ptp(base_colors(written)) / 510 + 1e-6)
+    torch.testing.assert_close(
+        read.opacity_logits.sigmoid(), written.opacity_logits.sigmoid(), atol=0.5 / 255 + 1e-6, rtol=0
+    )
+    # The three smaller parts of a rotation are within half of a 1023rd of sqrt(2).
+    unit = torch.nn.functional.normalize(written.quaternions.double(), dim=1)
+    assert 1 - float((unit * read.quaternions.double()).sum(1).abs().min()) < 3e-6
+    # Along the axes of the file, where coefficients are what bytes stand for.
+    np.testing.assert_allclose(read.shN.numpy(), written.shN.numpy().clip(-4 + 1 / 64, 4 - 1 / 64), atol=1 / 64 + 1e-4)
+
+
 def test_the_independent_reader_of_playcanvas_reads_it(tmp_path):
     """splat-transform (MIT, npm) makes a plain PLY of it, with what it reads from it."""
     node = shutil.which("node")

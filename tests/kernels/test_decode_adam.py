@@ -118,7 +118,7 @@ def test_rows_that_are_not_given_keep_their_bits():
     _, after = fused(cpu, scene, gradients_of(scene))
     others = torch.ones(700, dtype=torch.bool)
     others[ROWS] = False
-    for a, b in zip(before, after, strict=False):
+    for a, b in zip(before, after[:9], strict=True):
         assert torch.equal(a[others], b[others])
         assert not torch.equal(a[ROWS], b[ROWS])
 
@@ -139,7 +139,7 @@ def test_a_frozen_decoder_gets_no_gradients():
     answer = cpu.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone())
     assert answer == (True, None)
     _, expected = fused(cpu, scene, gradients)
-    assert all(torch.equal(a, b) for a, b in zip([t for s in states for t in s[:3]], expected, strict=False))
+    assert all(torch.equal(a, b) for a, b in zip([t for s in states for t in s[:3]], expected[:9], strict=True))
 
 
 def test_nothing_visible_moves_nothing():
@@ -147,7 +147,7 @@ def test_nothing_visible_moves_nothing():
     finite, after = fused(cpu, scene, gradients_of(scene, none), none)
     before = [t for state in states_of(scene) for t in state[:3]]
     assert finite
-    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=False))
+    assert all(torch.equal(a, b) for a, b in zip(before, after[:9], strict=True))
     assert all(not t.any() for t in after[9:])
 
 

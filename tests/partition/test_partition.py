@@ -84,6 +84,14 @@ def test_on_the_axes_of_the_ground_frame_the_cut_does_not_turn_with_the_scene() 
         assert np.array_equal(owners(after, turned), owners(before, positions)) == same
 
 
+def test_far_outliers_turn_no_axes() -> None:
+    ground = town()[0][:, :2]
+    far = np.random.default_rng(9).normal([5000.0, 3500.0], 50.0, (len(ground) // 100, 2))
+    there, beside = (clustering.fit_principal_plane(each) for each in (ground, np.concatenate([ground, far])))
+    assert np.linalg.norm(beside.center - there.center) < 1.0
+    np.testing.assert_allclose(beside.axes, there.axes, atol=0.05)
+
+
 def test_positions_are_normalized_between_the_outermost_anchors_or_clipped() -> None:
     points = np.array([[0.0, 5.0]] * 50 + [[10.0, 7.0]] * 50 + [[1000.0, 6.0]])
     features = clustering.clustering_features(points, np.arange(101), 0.5, 0.0)
@@ -310,6 +318,10 @@ def test_an_alpha_shape_follows_a_bay_and_widening_follows_the_area() -> None:
     assert expand_core(disc, 0.4).area == pytest.approx(1.96 * disc.area, rel=0.01)
     assert expand_core(disc, 0.0) is disc
     assert alpha_shape(np.array([[0.0, 0], [1, 1], [2, 2]]), 1.0) is None
+    # Nor do places on a line have one where rounding puts them beside it.
+    along = np.linspace(0.0, 100.0, 30)
+    beside = np.column_stack([along, along / 3 + np.random.default_rng(0).uniform(-1e-12, 1e-12, 30)])
+    assert alpha_shape(beside, 1.0) is None
 
 
 # ------------------------------------------------------------------------------------------------ files

@@ -42,6 +42,7 @@ from vdgs.runs.lod_status import lod_status
 from vdgs.runs.open_run import ModelLocation, open_mapped
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
+from vdgs.system.quoting import shell_word
 from vdgs.system.tensors import file_id, read_tensors, write_tensors
 
 CAMERAS = [
@@ -410,7 +411,7 @@ def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
         }
         (stage,) = lod_status(coarse.run, SimpleNamespace(of=models.__getitem__))
         assert (stage.state, stage.reason) == ("stale", "made by another version of vdgs")
-        assert stage.command == f"vdgs lod {coarse.run.path}{end}"
+        assert stage.command == f"vdgs lod {shell_word(coarse.run.path)}{end}"
     (folder / TREE_FILE).unlink()
     with pytest.raises(RunError, match="no finished level-of-detail tree"):
         open_tree(opened)

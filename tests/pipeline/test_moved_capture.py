@@ -32,6 +32,7 @@ from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.visibility_store import get_run_visibility
+from vdgs.system.quoting import shell_line
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
 
@@ -260,15 +261,15 @@ def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained
 def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder, tmp_path):
     run = RunFolder(folder / "run")
     settings, gone = run.settings(), tmp_path / "gone" / "place"
-    for command, moved in (
-        (f"vdgs run {gone} --output 'a run' --overwrite", f"vdgs run {folder}/place --output 'a run' --overwrite"),
-        (
-            f"vdgs run {gone} --gps {gone}/g.csv -o {gone}s",
-            f"vdgs run {folder}/place --gps {folder}/place/g.csv -o {gone}s",
-        ),
-        ("vdgs run place --output run", None),
-        (None, None),
-    ):
+
+    def commands(place: Path) -> tuple[str, str]:
+        return (
+            shell_line(["vdgs", "run", place, "--output", "a run", "--overwrite"]),
+            shell_line(["vdgs", "run", place, "--gps", place / "g.csv", "-o", f"{gone}s"]),
+        )
+
+    named = zip(commands(gone), commands(folder / "place"), strict=True)
+    for command, moved in (*named, ("vdgs run place --output run", None), (None, None)):
         run.config.write(settings, command)
         run.move_capture(gone)  # where it was
         assert run.config.command() == command

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from support.captures import look_down
 from support.mapped_house import (
@@ -22,13 +24,20 @@ from support.mapped_house import (
 )  # fmt: skip
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.map_projection import MapProjection
+from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import render
-from vdgs.rendering.ortho import ortho_plan
+from vdgs.rendering.ortho import ortho_plan, previews
 from vdgs.rendering.ortho.geotiff import GDAL_CACHE_BYTES, limit_gdal_cache
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid, capture_extent, grid_from_bbox, ground_sampling_distance
 from vdgs.rendering.ortho.previews import floor_to_nice_length, hillshade
-from vdgs.rendering.ortho.tile_renderer import NODATA_COUNT, NODATA_HEIGHT, samples_per_side
+from vdgs.rendering.ortho.tile_renderer import (
+    NODATA_COUNT,
+    NODATA_HEIGHT,
+    OrthoTile,
+    TileRenderer,
+    samples_per_side,
+)
 
 rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
@@ -100,6 +109,75 @@ def test_files_are_cloud_optimized_and_say_what_they_are(fine):
         assert "ellipsoidal" in file.descriptions[0]
 
 
+#: 600 x 100 pixels, so that there are overviews; x rises to the right from 0, in pixels.
+STRIP = {"crs": "local", "bbox": (-6.0, -1.0, 6.0, 1.0), "gsd": 0.02}
+STRIP_SHAPE = (100, 600)
+
+
+def strip_tile(grid: PixelGrid) -> OrthoTile:
+    """What a tile of `STRIP` shows in the tests below: noise and holes above, a checkerboard without holes below, and
+    everywhere a slope of 0.3 to the east."""
+    column = round((grid.left - STRIP["bbox"][0]) / grid.gsd) + np.arange(grid.width)
+    x, y = np.meshgrid(column, np.arange(grid.height))
+    noise, upper = np.random.default_rng(grid.width), y < 50
+    colors = np.where(upper[..., None], noise.integers(0, 256, (*x.shape, 3)), ((x + y) % 2 * 255)[..., None])
+    shown = ~upper | (noise.random(x.shape) < 0.6)
+    return OrthoTile(
+        (colors * shown[..., None]).astype(np.uint8), np.where(shown, 255, 0).astype(np.uint8),
+        np.where(shown, 0.3 * grid.gsd * x - 1.0, NODATA_HEIGHT).astype(np.float32),
+        np.where(shown, noise.integers(2, 9, x.shape), NODATA_COUNT).astype(np.uint16),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def strip(house, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps of what `strip_tile` says; pictures are a quarter as long. Not to be changed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TileRenderer, "render_tile", lambda _, grid: strip_tile(grid))
+        patch.setattr(previews, "MAX_IMAGE_PX", 150)
+        return draw_maps(tmp_path_factory.mktemp("strip") / "run", *house, **STRIP)
+
+
+def test_files_hold_what_was_drawn_and_map_json_sums_it_up(strip):
+    height, width = STRIP_SHAPE
+    drawn = [strip_tile(part) for *_, part in PixelGrid(-6.0, 1.0, 0.02, width, height).tiles()]
+    assert len(drawn) == 2
+    colors, alpha, heights, visibility = (
+        np.concatenate([getattr(tile, name) for tile in drawn], axis=1)
+        for name in ("colors", "alpha", "heights", "visibility")
+    )
+    with rasterio.open(strip / "orthophoto.tif") as file:
+        assert [band.name for band in file.colorinterp] == ["red", "green", "blue", "alpha"]
+        np.testing.assert_array_equal(file.read(), np.moveaxis(np.dstack([colors, alpha]), -1, 0))
+    for name, values in (("dsm", heights), ("visibility", visibility)):
+        with rasterio.open(strip / f"{name}.tif") as file:
+            np.testing.assert_array_equal(file.read(1), values)
+    shown, facts = alpha > 0, json.loads((strip / "map.json").read_text())
+    assert facts["mapped_share"] == pytest.approx(shown.mean())
+    assert facts["seen_by_fewer_than_5_share"] == pytest.approx((visibility[shown] < 5).mean())
+    assert (facts["lowest"], facts["highest"]) == pytest.approx((heights[shown].min(), heights[shown].max()))
+
+
+def test_overviews_of_an_orthophoto_hold_mean_colors(strip):
+    with rasterio.open(strip / "orthophoto.tif", overview_level=0) as file:
+        lower = file.read()[:, 26:]
+    assert np.abs(lower[:3].astype(int) - 127.5).max() <= 0.5
+    assert (lower[3] == 255).all()
+
+
+def test_pictures_for_people_have_the_colors_and_the_slopes_of_the_map(strip, tmp_path, monkeypatch):
+    # Of a map longer than a picture, the light is that of the slope in metres.
+    light = np.asarray(Image.open(strip / "hillshade.png"))
+    assert light.shape == (25, 150, 4)
+    x = np.broadcast_to(np.arange(20.0), (5, 20))
+    np.testing.assert_allclose(light[14:-1, 1:-1, 0] / 255, hillshade(0.3 * x, 1.0)[2, 2], atol=0.5 / 255 + 1e-4)
+    # Of one that is no longer, the picture is the map.
+    monkeypatch.setattr(previews, "MAX_IMAGE_PX", 600)
+    previews.write_picture(strip / "orthophoto.tif", tmp_path / "whole.png")
+    with rasterio.open(strip / "orthophoto.tif") as file:
+        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "whole.png")), np.moveaxis(file.read(), 0, -1))
+
+
 def test_overviews_have_no_height_between_roof_and_street_either(fine):
     for name, nothing in (("dsm", NODATA_HEIGHT), ("visibility", NODATA_COUNT)):
         with rasterio.open(fine / f"{name}.tif") as file:
@@ -124,6 +202,43 @@ def test_walls_do_not_smear(house, samples):
     assert between.mean() < 0.001
     roof = np.count_nonzero(heights > ROOF / 2) * 0.01
     assert roof == pytest.approx((HOUSE[2] - HOUSE[0]) * (HOUSE[3] - HOUSE[1]), rel=0.15)
+
+
+def test_of_samples_the_height_of_a_pixel_is_the_higher_in_the_middle(house):
+    """Of four the second from above: half of the pixel lies as high."""
+    capture, model = house
+    placement = MapProjection.of(capture.ground, "local")
+    grid = PixelGrid(-2.0, 2.0, 0.2, 16, 16)
+    each = surveyor_of(model, capture, placement).render_tile(PixelGrid(-2.0, 2.0, 0.1, 32, 32)).heights
+    ordered = np.sort(each.reshape(16, 2, 16, 2).swapaxes(1, 2).reshape(16, 16, 4), axis=-1)
+    assert (ordered[..., 2] - ordered[..., 1]).mean() > 2e-3
+    together = surveyor_of(model, capture, placement, 2).render_tile(grid).heights
+    np.testing.assert_allclose(together, ordered[..., 2], atol=1e-4)
+
+
+def test_what_is_half_transparent_is_as_bright_as_what_is_opaque(house):
+    """White splats over nothing: black shows through nowhere."""
+    capture, model = house
+    tensors = {name: tensor.clone() for name, tensor in model.decoder.tensors().items()}
+    for head, bias in (("color", 20.0), ("opacity", 0.2)):
+        tensors[f"{head}_w2"].zero_()
+        tensors[f"{head}_b2"].fill_(bias)
+    sheer = replace(model, decoder=Decoder.from_tensors(tensors))
+    camera = NadirCamera.of(capture, placement := MapProjection.of(capture.ground, "local")).camera(
+        grid := PixelGrid(-2.0, 2.0, 0.1, 40, 40)
+    )
+    alpha = render(sheer, camera).alpha.numpy()
+    tile = surveyor_of(sheer, capture, placement).render_tile(grid)
+    assert 0.5 < alpha[tile.alpha > 0].min() < 0.9
+    assert tile.colors[tile.alpha > 0].min() >= 250
+
+
+def test_more_cameras_than_a_byte_holds_are_counted(house):
+    capture, model = house
+    crowd = replace(capture, views=tuple(replace(capture.views[1], name=f"{k}.png") for k in range(300)))
+    placement = MapProjection.of(capture.ground, "local")
+    tile = surveyor_of(model, crowd, placement).render_tile(PixelGrid(-3.0, 1.0, 0.5, 4, 4))
+    assert (tile.visibility == 300).all()
 
 
 def test_a_map_ends_with_the_scene_and_not_with_what_cameras_see_behind_it(house):
@@ -234,6 +349,9 @@ def test_lines_of_a_grid_are_at_multiples_of_its_pixels():
     np.testing.assert_allclose(grid.bounds, (100.0, 50.0, 102.0, 51.0), atol=1e-9)
     assert (grid.width, grid.height, grid.tile_count(8)) == (20, 10, 6)
     assert sum(part.width * part.height for _, _, part in grid.tiles(8)) == 200
+    # A box that ends on lines but for rounding ends there: 0.3 / 0.1 is a little below 3, 0.7 / 0.1 a little below 7.
+    on_lines = grid_from_bbox((0.3, 0.7, 0.9, 1.1), 0.1)
+    assert (on_lines.width, on_lines.height) == (6, 4)
 
 
 def test_light_of_a_hillshade():

@@ -91,6 +91,17 @@ def test_a_straight_line_stays_straight():
     np.testing.assert_allclose(path, np.linspace([0, 0, 10], [3, 6, 10], 50), atol=1e-9)
 
 
+def test_a_zoom_goes_evenly_from_key_to_key_in_pixels_of_the_first():
+    keys = [
+        standing([0, 0, 10], [0, 5, 0], fx=100.0, fy=120.0),
+        standing([10, 0, 10], [10, 5, 0], fx=400.0, fy=480.0, cx=320.0, cy=160.0, width=640, height=360),
+    ]
+    path = interpolate(keys, 3)
+    assert {(camera.width, camera.height) for camera in path} == {(320, 180)}
+    found = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in path]
+    np.testing.assert_allclose(found, [(100, 120, 160, 90), (150, 180, 160, 85), (200, 240, 160, 80)])
+
+
 def test_interpolation_commutes_with_a_rigid_motion():
     keys = [
         standing([0, 0, 10], [0, 5, 0]),
@@ -353,8 +364,22 @@ def test_an_orbit_looks_at_the_scene_from_where_the_flight_was():
     for camera in path.cameras:
         assert camera.position[2] == pytest.approx(30)
         np.testing.assert_allclose(camera.project(center[None])[0][0], [160, 90], atol=1e-6)
-    extent = np.ptp([camera.position for camera in cameras], axis=0).max()
-    assert max(np.linalg.norm(camera.position[:2] - center[:2]) for camera in path.cameras) < extent
+
+
+def test_an_orbit_has_two_thirds_of_the_reach_of_the_flight_and_no_seam():
+    """Along and across a flight that is longer than wide; the last frame is as far from the first as from its other
+    neighbor."""
+    cameras = strips(rows=4, columns=20)
+    center = np.array([38.0, 18.0, 0.0])
+    path = orbit(center[None], cameras, TEMPLATE, seconds=4.0, fps=25.0)
+    flown = np.array([camera.position for camera in cameras]) - center
+    around = (np.array([camera.position for camera in path.cameras]) - center)[:, :2]
+    radii = 2 / 3 * np.quantile(np.abs(flown[:, :2]), 0.9, axis=0)
+    np.testing.assert_allclose(np.abs(around).max(axis=0), radii)
+    angles = np.arctan2(*(around / radii).T)
+    turns = np.diff(np.unwrap([*angles, angles[0]]))
+    np.testing.assert_allclose(np.abs(turns), 2 * np.pi / 100)
+    assert np.abs(turns.sum()) == pytest.approx(2 * np.pi)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
@@ -378,6 +403,14 @@ def test_a_flyover_follows_the_flight(shuffled: bool):
     if not shuffled:  # a turn at the end of a strip takes many frames
         turned = np.degrees(np.arccos(np.clip((forwards[1:] * forwards[:-1]).sum(1), -1, 1)))
         assert turned.max() < 10
+
+
+def test_a_flyover_looks_down_as_the_cameras_in_the_middle_do():
+    tilts = np.radians([25.0, 60.0, 40.0, 25.0, 60.0])
+    cameras = [standing([4.0 * k, 0, 30], [4.0 * k + np.tan(tilt), 0, 29]) for k, tilt in enumerate(tilts)]
+    path = flyover(cameras, TEMPLATE, seconds=0.4, fps=25.0)
+    forwards = np.array([camera.forward for camera in path.cameras])
+    np.testing.assert_allclose(np.degrees(np.arccos(-forwards[:, 2])), 40, atol=1e-6)
 
 
 def test_a_flyover_of_one_camera_stands_still():

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
+from support.hand_made_models import camera_above, opaque_plane
 from vdgs.config.commands import RenderRequest
 from vdgs.errors import VdgsError
+from vdgs.model.renderer import render
 from vdgs.rendering import render_folder
 from vdgs.rendering.render_run import _check
 from vdgs.rendering.scalar_maps import (
@@ -20,6 +22,7 @@ from vdgs.rendering.scalar_maps import (
     alpha_scale,
     depth_range,
     depth_scale,
+    render_depth,
     visibility_scale,
 )
 from vdgs.system.figure_style import VISIBILITY_CMAP
@@ -97,6 +100,15 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "film").write_bytes(b"")
     with pytest.raises(VdgsError, match="is a file"):
         render_folder.begin_render(tmp_path / "film", ["a.png"])
+
+
+def test_a_pixel_has_a_depth_where_it_is_more_than_half_opaque() -> None:
+    """At the edge of a sheet, where splats thin out."""
+    model, camera = opaque_plane(), camera_above(3.0, 0.0)
+    alpha, depth = render(model, camera).alpha.numpy(), render_depth(model, camera)
+    assert ((alpha > 0.05) & (alpha <= 0.5)).sum() > 10
+    np.testing.assert_array_equal(np.isfinite(depth), alpha > 0.5)
+    np.testing.assert_allclose(depth[alpha > 0.5], 4.0, atol=0.05)
 
 
 def test_the_range_of_depths_holds_every_view() -> None:

@@ -138,7 +138,7 @@ def test_samples_are_repeatable_and_lengths_are_for_people():
 @pytest.mark.capture
 def test_a_real_capture_is_as_its_readme_says(tmp_path):
     """copr: 21.1 m to the surface and 0.99 cm per pixel at full size, so 3.96 at a quarter."""
-    report = inspect_capture(load_capture(data_folder("copr"), CaptureOptions(images="images_4")), tmp_path)
+    report = inspect_capture(load_capture(data_folder("copr", "images_4"), CaptureOptions(images="images_4")), tmp_path)
     assert report.place.ground_sampling_distance == pytest.approx(0.0396, rel=0.05)
     assert report.tilt_deg == pytest.approx(8.2, abs=0.1)
     assert report.warnings == []

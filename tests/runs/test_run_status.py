@@ -36,6 +36,7 @@ from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_MODEL, OTHER_PARTITION, OTH
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import is_locked, lock_folder
+from vdgs.system.quoting import shell_line, shell_word
 from vdgs.system.step_progress import StepRecord, read_step
 from vdgs.system.tensors import file_id
 
@@ -104,7 +105,7 @@ def test_a_whole_run_is_whole(run, capsys):
     said = capsys.readouterr().out
     assert "10 done" in said
     assert f"report: {run.path / 'report.html'}" in said
-    assert next_commands(said) == [f"vdgs view {run.path}"]
+    assert next_commands(said) == [f"vdgs view {shell_word(run.path)}"]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ def test_what_other_settings_make_out_of_date_is_shown_nowhere_as_done(run, sect
     change(run, section, **setting)
     assert states(run) == dict.fromkeys([*stale, "report"], "stale")
     assert command_line("status", run.path) == EXIT_INCOMPLETE
-    assert f"next: vdgs {then} {run.path}" in capsys.readouterr().out
+    assert f"next: vdgs {then} {shell_word(run.path)}" in capsys.readouterr().out
     page = write_report(run).read_text()
     assert "24.75" not in page  # of the merged model
     assert "merged.jpg" not in page
@@ -234,7 +235,7 @@ def test_programs_read_the_same(run, capsys):
     assert command_line("status", run.path, "--json") == EXIT_INCOMPLETE
     facts = json.loads(capsys.readouterr().out)
     assert not facts["complete"]
-    assert facts["next_command"] == f"vdgs merge {shlex.quote(str(run.path))}"
+    assert facts["next_command"] == f"vdgs merge {shell_word(run.path)}"
     assert {row["stage"]: row["state"] for row in facts["stages"]}["merge"] == "stale"
 
 
@@ -246,7 +247,10 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
     with pytest.raises(RunError, match=r"is the model of block 1\. Put back .* or delete"):
         load_verified(zero, key, 0)
     assert get_run_status(run).of("block 0").state == "stale"
-    assert next_commands(next_line(get_run_status(run))) == [f"rm -r {zero.path}", f"vdgs train-blocks {run.path}"]
+    assert next_commands(next_line(get_run_status(run))) == [
+        shell_line(["rm", "-r", zero.path]),
+        shell_line(["vdgs", "train-blocks", run.path]),
+    ]
     zero.model.write_bytes(own)
     model = model_at(PLACES, seed=8)  # of the right block, but not what was trained here
     replace(model, metadata=ModelMetadata(key=key, block=0)).save(zero.model)
@@ -272,7 +276,7 @@ def test_the_model_that_is_opened_says_what_it_is(run, opened_without_photograph
     opened = open_run(run.path)
     assert opened.name == "coarse"
     assert f"this is the coarse model, not the merged one: there is one that was {OTHER_SETTINGS}" in opened.warning
-    assert f"vdgs partition {run.path}" in opened.warning
+    assert f"vdgs partition {shell_word(run.path)}" in opened.warning
     assert open_run(run.path, "coarse").warning == ""  # as was asked for
     with pytest.raises(RunError, match=f"no merged model of its settings yet .*{OTHER_SETTINGS}.*vdgs partition"):
         open_run(run.path, "merged")
@@ -286,7 +290,7 @@ def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_wit
     opened = open_run(run.path)
     assert opened.name == "merged"
     assert OTHER_BLOCKS in opened.warning
-    assert f"vdgs merge {run.path}" in opened.warning
+    assert f"vdgs merge {shell_word(run.path)}" in opened.warning
 
 
 def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
@@ -295,13 +299,13 @@ def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(
     other = replace(run.settings(), merge=MergeConfig("max-visibility"))
     run.change_settings(other, overwrite=True)
     assert run.config.command() is None
-    assert get_run_status(run).next_command() == f"vdgs merge {run.path}"
+    assert get_run_status(run).next_command() == f"vdgs merge {shell_word(run.path)}"
     run.change_settings(replace(run.settings(), merge=MergeConfig()), overwrite=True, command="vdgs run anew")
     assert get_run_status(run).next_command() == "vdgs run anew"
 
 
 def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
-    run.config.write(run.settings(), f"vdgs run place --output {run.path}")
+    run.config.write(run.settings(), f"vdgs run place --output {shell_word(run.path)}")
     assert run.config.command() is not None
     copy = RunFolder(tmp_path / "a copy")
     shutil.copytree(run.path, copy.path)
@@ -356,7 +360,7 @@ def test_only_the_driver_of_a_run_records_its_steps(run):
 def test_a_status_file_that_is_damaged_is_deleted_first(run):
     run.block(1).status_file.write_text("{}")
     commands = next_commands(next_line(get_run_status(run)))
-    assert commands == [f"rm {run.block(1).status_file}", f"vdgs train-blocks {run.path}"]
+    assert commands == [shell_line(["rm", run.block(1).status_file]), shell_line(["vdgs", "train-blocks", run.path])]
 
 
 @pytest.mark.parametrize("content", ["", "[1, 2"])

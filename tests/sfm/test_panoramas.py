@@ -66,9 +66,9 @@ def test_panoramas_are_known_by_their_tags_or_asked_for(tmp_path):
         write(tmp_path / "plain", k, b"")
         write(tmp_path / "part", k, b'<r GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="480" '
               b'GPano:CroppedAreaImageWidthPixels="240"/>')  # fmt: skip
-    assert all(photo.is_panorama for photo in collect_images([tmp_path / "tagged"]).images)
-    assert not any(photo.is_panorama for photo in collect_images([tmp_path / "plain"]).images)
-    assert all(photo.is_panorama for photo in collect_images([tmp_path / "plain"], "equirectangular").images)
+    for asked, known in (("tagged",), True), (("plain",), False), (("plain", "equirectangular"), True):
+        found = collect_images([tmp_path / asked[0]], *asked[1:]).images
+        assert [photo.is_panorama for photo in found] == [known] * 3
     with pytest.raises(VdgsError, match="is a part of a panorama"):
         collect_images([tmp_path / "part"])
     plan = plan_reconstruction(SfmRequest(image_folders=(tmp_path / "tagged",), output=tmp_path / "out"))

@@ -20,6 +20,7 @@ from vdgs.captures.xmp_packets import MAX_XMP_BYTES
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.sfm import georeferencing, georegistration
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
 from vdgs.sfm.georegistration import tilt_from_attitudes
 from vdgs.sfm.gps_priors import read_gps_priors
@@ -267,6 +268,26 @@ def test_a_table_of_positions_wins(tmp_path):
     found = read_gps_priors(seen, table, (0.5, 0.7))
     assert (len(found), found.source, found.origin[1]) == (4, "gps.csv", 20)
     assert found.gps_std[0] == pytest.approx([0.5, 0.5, 0.7])
+
+
+@pytest.mark.parametrize(
+    ("options", "std", "stated"),
+    [(SfmOptions(gps_std_m=(0.5, 0.7)), [0.5, 0.5, 0.7], True), (SfmOptions(), [1.0, 1.0, 2.0], False)],
+)
+def test_the_accuracy_that_is_asked_for_is_that_of_a_table_and_counts_as_stated(
+    tmp_path, monkeypatch, options, std, stated
+):
+    (tmp_path / "card").mkdir()
+    flight(tmp_path / "card")
+    table, asked = tmp_path / "gps.csv", list[bool]()
+    table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(4)))
+    plan = plan_reconstruction(
+        SfmRequest(image_folders=(tmp_path / "card",), gps=table, output=tmp_path / "out", options=options)
+    )
+    np.testing.assert_allclose(plan.gps_priors.gps_std, [std] * 4)
+    monkeypatch.setattr(georegistration, "georegister", lambda *given: asked.append(given[-1]))
+    georeferencing._by_positions(None, plan)
+    assert asked == [stated]
 
 
 def test_a_long_corridor_has_no_outliers(tmp_path):

@@ -240,11 +240,13 @@ def write_ply(file: Path, points: np.ndarray, colors: np.ndarray, *, text: bool 
     file.write_bytes(header.encode() + body)
 
 
-def data_folder(name: str) -> Path:
-    """A real capture by name ("copr"), from $VDGS_DATA or ../shared/data; skips the test without it."""
+def data_folder(name: str, *needed: str) -> Path:
+    """A real capture by name ("copr"), from $VDGS_DATA or ../shared/data; skips the test where it, or what is `needed`
+    of it beside its model, is not there."""
     base = Path(os.environ.get("VDGS_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
-    if not (base / name / "sparse").is_dir():
-        pytest.skip(f"no real capture {name!r} (set VDGS_DATA)")
+    for each in ("sparse", *needed):
+        if not (base / name / each).exists():
+            pytest.skip(f"no {each} of the real capture {name!r} in {base} (set VDGS_DATA)")
     return base / name
 
 

@@ -21,17 +21,22 @@ GB = 10**9
 NONE = 9223372036854771712
 
 
+def escaped(path: Path) -> str:
+    """As mountinfo has a path."""
+    return str(path).replace("\\", r"\134").replace(" ", r"\040")
+
+
 class Machine:
     """A made-up /proc/self and the hierarchies of control groups that it tells of."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.mounts = [f"22 1 8:1 / {folder} rw - ext4 /dev/sda1 rw"]
+        self.mounts = [f"22 1 8:1 / {escaped(folder)} rw - ext4 /dev/sda1 rw"]
 
     def mount(self, name: str, version: int, root: str = "/") -> Path:
         kind, options = ("cgroup2", "rw") if version == 2 else ("cgroup", "rw,memory" if version == 1 else "rw,cpu")
         mounted = self.folder / "sys" / name
-        self.mounts.append(f"31 23 0:28 {root} {mounted} rw,relatime shared:9 - {kind} {kind} {options}")
+        self.mounts.append(f"31 23 0:28 {root} {escaped(mounted)} rw,relatime shared:9 - {kind} {kind} {options}")
         return mounted
 
     def limits(self, groups: str) -> list[CgroupLimit]:

@@ -135,8 +135,10 @@ def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
     again = visibility_ratio(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
     assert torch.equal(share, again)
     assert torch.equal(share, count_visibility(points, cameras).float() / 7)
-    moved = replace(cameras[0], cx=cameras[0].cx + 4)
-    assert not torch.equal(share, visibility_ratio(points, [*cameras, moved]))
+    # Two parts of one picture are two views: what one of them shows, the other does not.
+    for part in ({"cx": cameras[0].cx - 24}, {"cy": cameras[0].cy + 20}):
+        both = [*cameras, replace(cameras[0], **part)]
+        assert torch.equal(visibility_ratio(points, both), count_visibility(points, both).float() / 8)
     with pytest.raises(ValueError, match="without cameras"):
         visibility_ratio(points, [])
 

@@ -41,7 +41,8 @@ LARGEST_LOG = 20.0
 #: Coefficients of spherical harmonics lie between minus and plus half of this.
 SPAN = 8.0
 LOST = (
-    "positions and sizes are rounded to 1/2047 of what their chunk of 256 neighbors spans, colors to bytes, changing "
+    "positions and sizes are rounded to 1/2047 of what their chunk of 256 neighbors spans (along the second axis to "
+    "1/1023), colors to bytes, changing "
     f"colors to {SPAN / 256:.3f}"
 )
 
