@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vdgs.captures.gps_altitudes import wrong_reading
-from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.position_adjustment import PositionFit, Problem, Up
+from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.up_axis import up_by_views
 from vdgs.sfm.georegistration import _checked_on_a_line
 from vdgs.sfm.image_metadata import attitude_from_gimbal

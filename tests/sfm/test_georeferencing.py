@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from vdgs.captures import reconstruction
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions, radius_95
+from vdgs.captures.position_adjustment import PositionFit, Problem, Up, radius_95
+from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError

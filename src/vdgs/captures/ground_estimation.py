@@ -31,7 +31,8 @@ from vdgs.captures.gps_altitudes import refuse_unit, wrong_unit
 from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.odd_positions import MIN_SPREAD_M, do_not_spread
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import PositionFit, Problem, Up, fit_positions
+from vdgs.captures.position_adjustment import PositionFit, Problem, Up
+from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.reconstruction import by_axis
 from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.up_axis import estimate_up, up_by_views

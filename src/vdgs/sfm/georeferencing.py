@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import Up
+from vdgs.captures.position_adjustment import Up
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.captures.table_columns import FOOT_M
 from vdgs.config.sfm_options import SfmOptions

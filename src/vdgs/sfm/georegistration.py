@@ -9,7 +9,8 @@ import numpy as np
 
 from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_fit import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up, fit_positions
+from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up
+from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError

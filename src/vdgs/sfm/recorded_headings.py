@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vdgs.captures.plane_fit import fit_plane, in_plane
-from vdgs.captures.position_fit import PositionFit
+from vdgs.captures.position_adjustment import PositionFit
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
