@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from support.advice import advised_words
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap, write_images, write_ply
 from vdgs.captures.formats.colmap import has_points, read_colmap
 from vdgs.captures.formats.source_capture import CAMERA_MODELS
@@ -254,9 +255,8 @@ def test_a_larger_model_without_a_number_is_named_with_what_uses_it(tmp_path):
     write_colmap(tmp_path, part, images=None, sparse="sparse/old")
     [note] = [note for note in load_capture(tmp_path, CaptureOptions(up="z")).warnings if "vdgs run" in note]
     assert note.startswith("sparse/geo holds 12 images, and sparse/0, which is read, 3.")
-    command = re.search(r"vdgs run (\S+) --images (\S+) --output RUN", note)
-    assert command is not None
-    assert len(load_capture(Path(command[1]), CaptureOptions(images=command[2], up="z")).views) == 12
+    capture, images = advised_words("vdgs run WORD --images WORD --output RUN", note)
+    assert len(load_capture(Path(capture), CaptureOptions(images=images, up="z")).views) == 12
 
 
 @pytest.mark.capture

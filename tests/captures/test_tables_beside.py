@@ -14,6 +14,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
+from vdgs.system.quoting import shell_word
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 TABLES = {
@@ -45,7 +46,7 @@ def test_a_table_beside_photographs_is_named_before_the_work(tmp_path, name):
     priors, said = planned(tmp_path, name, TABLES[name], placed=True)
     assert priors.source == "EXIF"
     file = Path(name).name
-    path = tmp_path / name
+    path = shell_word(tmp_path / name)
     assert said == [f"{file} beside the photographs holds positions of 3 of 3; not used. To use it: --gps {path}"]
 
 
@@ -71,7 +72,7 @@ def test_control_points_and_other_texts_beside_photographs(tmp_path):
     (tmp_path / "b").mkdir()
     text = "EPSG:32632\n462000 5200000 500 10 10 {0} p1\n"
     _, (said,) = planned(tmp_path / "a", "card/gcp_list.txt", text, placed=True)
-    assert said.endswith(f"is not used. To use it: --gcp {tmp_path / 'a/card/gcp_list.txt'}")
+    assert said.endswith(f"is not used. To use it: --gcp {shell_word(tmp_path / 'a/card/gcp_list.txt')}")
     assert planned(tmp_path / "b", "card/readme.txt", "A flight of {0}\n\nOn a day, 1, 2, 3\n", placed=True)[1] == []
 
 
@@ -82,7 +83,7 @@ def test_a_table_beside_a_capture_without_a_place_is_named(tmp_path):
     rows = [f"{name},{47 + k // 4 * 1e-4},{8 + k % 4 * 1e-4},400" for k, name in enumerate(names)]
     (tmp_path / "gps.csv").write_text("name,lat,lon,alt\n" + "\n".join(rows))
     said = [each for each in load_capture(tmp_path, CaptureOptions()).warnings if "beside" in each]
-    file = tmp_path / "gps.csv"
+    file = shell_word(tmp_path / "gps.csv")
     number = len(names)
     assert said == [
         f"gps.csv beside the photographs holds positions of {number} of {number}; not used. To use it: --gps {file}"

@@ -20,6 +20,7 @@ from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.settings_file import read_settings_file, settings_text
+from vdgs.system.quoting import shell_word
 
 
 def read(file: Path) -> tuple[CaptureOptions, MethodConfig]:
@@ -40,7 +41,7 @@ def test_a_written_file_holds_every_setting_and_its_comment(preset, tmp_path, ca
     with pytest.raises(SystemExit) as ended:
         main(["config", "--preset", preset, "-o", str(file), "--images", "images_4"])
     assert ended.value.code == 0
-    assert f"--config {file}" in capsys.readouterr().out
+    assert f"--config {shell_word(file)}" in capsys.readouterr().out
     assert read(file) == (CaptureOptions(images="images_4"), PRESETS[preset])
     text = file.read_text()
     said = " ".join(line.strip().removeprefix("# ") for line in text.splitlines() if line.strip().startswith("#"))
