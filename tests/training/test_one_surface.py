@@ -38,6 +38,27 @@ def test_gradients_are_those_of_the_loss() -> None:
     assert 0 < shown.double().mean() < 1
 
 
+def test_what_a_mask_leaves_out_takes_no_part() -> None:
+    """Whatever is drawn there; parts of a picture add up to the whole, by what each keeps of it."""
+    generator = torch.Generator().manual_seed(2)
+    alpha, depth, median = (0.5 + torch.rand(12, 9, generator=generator) / 2 for _ in range(3))
+    raster = Raster(torch.zeros(12, 9, 3), alpha, depth * 5, median * 5)
+    mask = (torch.rand(12, 9, generator=generator) < 0.4).byte()
+    found, plain = depth_agreement(raster, HEIGHT, mask), depth_agreement(raster, HEIGHT)
+    kept = mask.double().mean()
+    for name in ("alpha", "depth"):
+        ours, theirs = getattr(found, name), getattr(plain, name)
+        assert not ours[mask == 0].any()
+        torch.testing.assert_close(ours, (theirs * mask / kept).float())
+    total = torch.zeros(())
+    for rows in (slice(0, 5), slice(5, 12)):
+        part = depth_agreement(Raster(*(each[rows] for each in raster)), HEIGHT, mask[rows])  # type: ignore[arg-type]
+        total += part.loss * mask[rows].sum() / mask.sum()
+    torch.testing.assert_close(total, found.loss)
+    nothing = depth_agreement(raster, HEIGHT, torch.zeros_like(mask))
+    assert not any(each.any() for each in nothing)
+
+
 def test_training_with_it_draws_splats_to_one_depth() -> None:
     def spread(weight: float) -> float:
         stage, state = block_stage(BlockConfig())
@@ -52,7 +73,7 @@ def test_training_with_it_draws_splats_to_one_depth() -> None:
 
 
 def test_every_second_step_counts_it_twice_and_the_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    def one(raster: Raster, _: float) -> DepthAgreement:
+    def one(raster: Raster, *_: object) -> DepthAgreement:
         return DepthAgreement(torch.tensor(1.0), torch.zeros_like(raster.alpha), torch.zeros_like(raster.alpha))
 
     def losses(weight: float) -> list[float]:

@@ -113,7 +113,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    if (agreement := _weighted_agreement(drawn, stage, iteration, target.valid_fraction)) is not None:
+    if (agreement := _weighted_agreement(drawn, stage, iteration, target)) is not None:
         loss = loss + agreement.loss
     values = torch.stack([loss, compared.l1, compared.ssim])
     if is_host(values):  # before anything moves
@@ -241,13 +241,14 @@ def image_index_at(stage: TrainingProblem, view: int) -> int:
 
 
 def _weighted_agreement(
-    drawn: RenderedTrainingView, stage: TrainingProblem, iteration: int, valid_fraction: float
+    drawn: RenderedTrainingView, stage: TrainingProblem, iteration: int, target: TrainingTarget
 ) -> DepthAgreement | None:
     """The loss of depths and its gradients, scaled to the whole photograph; None where none is due."""
-    weight = AGREEMENT_EVERY * stage.loss_weight * stage.config.loss.depth_agreement * valid_fraction
+    weight = AGREEMENT_EVERY * stage.loss_weight * stage.config.loss.depth_agreement * target.valid_fraction
     if not (weight and is_agreement_due(stage.config, iteration) and len(drawn.source)):
         return None
-    return DepthAgreement(*(weight * part for part in depth_agreement(drawn.raster, stage.camera_height)))
+    found = depth_agreement(drawn.raster, stage.camera_height, target.mask)
+    return DepthAgreement(*(weight * part for part in found))
 
 
 def _volume_weight(stage: TrainingProblem) -> float:
