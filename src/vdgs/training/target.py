@@ -77,6 +77,8 @@ class TrainingTarget:
     #: 1 where a pixel counts; None: everywhere.
     mask: UInt8[Tensor, "h w"] | None
     camera: Camera
+    #: How many pixels of the whole photograph count.
+    counted_pixels: int
     #: The share of the photograph's pixels that count in this part. Gradients are multiplied by it: those of a mean
     #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
     #: SSIM within its window of the part's border, where it sees nothing beyond).
@@ -102,6 +104,7 @@ def make_target(stage: TrainingProblem, view: int, downscale: int, box: PixelBox
         image=stage.copies.part(image, inside, stage.device),
         mask=None if mask is None else upload(mask, stage.device),
         camera=camera,
+        counted_pixels=of_whole,
         valid_fraction=share,
     )
 

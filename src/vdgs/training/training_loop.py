@@ -107,7 +107,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
             splats, target.camera, background, frozen, depth=with_pseudo_view or is_agreement_due(config, iteration),
             opacity_factors=factors,
         )  # fmt: skip
-    drawn = with_sky(drawn, stage, view, state.decoder, target.camera, background)
+    drawn = with_sky(drawn, stage, view, state.decoder, target, background)
     weight = stage.loss_weight
     compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config, weight)
     volume_weight, loss = _volume_weight(stage), compared.loss
