@@ -16,7 +16,7 @@ from vdgs.model.renderer import render
 from vdgs.training import train, training_loop
 from vdgs.training.depth_agreement import MIN_ALPHA, SMOOTH_BELOW, DepthAgreement, depth_agreement
 from vdgs.training.gradient_roi import crop_to_gradient_support
-from vdgs.training.target import opacity_factors_at
+from vdgs.training.target import background_at, opacity_factors_at
 from vdgs.training.training_step import render_for_training
 
 HEIGHT = 8.0
@@ -92,9 +92,10 @@ def test_every_second_step_counts_it_twice_and_the_others_do_not(monkeypatch: py
 
 def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:
     stage, _ = block_stage(BlockConfig())
-    assert opacity_factors_at(stage, 3, 5) is None
+    splats = one_splat(0.3, times=10_000)
+    assert opacity_factors_at(stage, 3, splats) is None
     noisy = replace(stage, config=replace(stage.config, loss=LossConfig(opacity_noise=0.2)))
-    one, again, other = (opacity_factors_at(noisy, iteration, 10_000) for iteration in (3, 3, 4))
+    one, again, other = (opacity_factors_at(noisy, iteration, splats) for iteration in (3, 3, 4))
     assert one is not None
     assert other is not None
     assert again is not None
@@ -104,11 +105,26 @@ def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:
     assert abs(float(one.std()) - 0.2) < 0.01
 
 
-def one_splat(opacity: float) -> TrainingSplats:
+def test_what_is_behind_a_step_says_nothing_of_its_opacities() -> None:
+    """Both are drawn anew in each step, neither from the numbers of the other."""
+    stage, _ = block_stage(BlockConfig())
+    loss = LossConfig(opacity_noise=0.2, random_background=1.0)
+    noisy, splats = replace(stage, config=replace(stage.config, loss=loss)), one_splat(0.3, times=16)
+
+    def drawn(step: int) -> list[float]:
+        factors = opacity_factors_at(noisy, step, splats)
+        assert factors is not None
+        return [float(background_at(noisy, step)[0]), abs(float(factors[0]) - 1)]
+
+    together = torch.tensor([drawn(step) for step in range(1000)]).T.corrcoef()
+    assert abs(float(together[0, 1])) < 0.1
+
+
+def one_splat(opacity: float, times: int = 1) -> TrainingSplats:
     return TrainingSplats(
-        means_px=torch.tensor([[9.0, 9.0]]), conics=torch.tensor([[0.1, 0.0, 0.1]]), depths=torch.ones(1),
-        colors=torch.ones(1, 3), opacities=torch.tensor([opacity]), segments=None,
-        source=torch.zeros(1, dtype=torch.int32), volume=torch.tensor(1.0),
+        means_px=torch.full((times, 2), 9.0), conics=torch.tensor([[0.1, 0.0, 0.1]]).repeat(times, 1),
+        depths=torch.ones(times), colors=torch.ones(times, 3), opacities=torch.full((times,), opacity), segments=None,
+        source=torch.arange(times, dtype=torch.int32), volume=torch.tensor(1.0),
     )  # fmt: skip
 
 

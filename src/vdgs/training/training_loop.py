@@ -98,7 +98,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     background, with_pseudo_view = background_at(stage, iteration), is_pseudo_view_due(config, iteration)
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
-        factors = opacity_factors_at(stage, iteration, len(splats.source))
+        factors = opacity_factors_at(stage, iteration, splats)
         if not with_pseudo_view:  # which begins at any place of the box, on any device
             box = crop_to_gradient_support(stage, splats, camera, box, factors)
         target = make_target(stage, view, downscale, box)
