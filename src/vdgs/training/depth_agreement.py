@@ -1,8 +1,8 @@
 """One depth for each pixel: what hangs before or behind the surface that a pixel shows is drawn towards it or fades.
 
 The loss is |expected depth − alpha · median depth| in camera heights, a mean over the pixels that count; the median
-depth stands still. Photographs look the same with splats spread in depth, views from elsewhere do not. (2DGS's depth distortion sums
-over pairs of splats, which takes another pass.)
+depth stands still. Photographs look the same with splats spread in depth, views from elsewhere do not. (2DGS's depth
+distortion sums over pairs of splats, which takes another pass.)
 """
 
 from __future__ import annotations
@@ -39,9 +39,7 @@ def is_agreement_due(config: TrainConfig, iteration: int) -> bool:
 
 
 @torch.no_grad()
-def depth_agreement(
-    raster: Raster, camera_height: float, mask: UInt8[Tensor, "h w"] | None = None
-) -> DepthAgreement:
+def depth_agreement(raster: Raster, camera_height: float, mask: UInt8[Tensor, "h w"] | None = None) -> DepthAgreement:
     """The loss of a picture drawn with depth, in units in which cameras are so high. Pixels where `mask` is zero do not
     count; with no pixel left, loss and gradients are 0."""
     assert raster.depth is not None

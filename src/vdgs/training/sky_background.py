@@ -42,9 +42,9 @@ def with_sky(
     background: Float[Tensor, "3"],
 ) -> RenderedTrainingView:  # fmt: skip
     """The view with the environment map of the decoder, where it has one and the view shows sky. Going backward leaves
-    in the `.grad` of the map how the loss changes with each of its cells: the mean over the pixels that show the cell and
-    count, in the loss of one pixel. Cells that show for less than a pixel count as if it were one: Adam would move them as
-    fast as the others, away from what no pixel holds."""
+    in the `.grad` of the map how the loss changes with each of its cells: the mean over the pixels that count and show
+    the cell, in the loss of one pixel. Cells that show for less than a pixel count as if it were one: Adam would move
+    them as fast as the others, away from what no pixel holds."""
     envmap, skyline = decoder.envmap, None if stage.skylines is None else stage.skylines[view]
     if envmap is None or skyline is None:
         return drawn
