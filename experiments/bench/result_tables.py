@@ -113,8 +113,10 @@ REFERENCE_EXPOSURE_NOTE = (
 #: Over which pixels, and what the columns hold.
 COVERAGE_NOTE = (
     "Over the pixels whose place at least 3 training cameras hold in their frustum, as the coarse model of each run "
-    "draws it. Opaque: alpha of at least 0.95. Error of depth: the median over these pixels, in percent of the camera "
-    "height; what is not drawn counts as infinitely far off. Large: longer than the picture, summed over the views."
+    "draws it, or, of methods without one, the measured model itself. So floaters hide themselves: one close before a "
+    "test camera, where fewer cameras look, takes what it covers out of the count. Opaque: alpha of at least 0.95. "
+    "Error of depth: the median over these pixels, in percent of the camera height; what is not drawn counts as "
+    "infinitely far off. Large: longer than the picture, summed over the views."
 )
 #: An anchor is no Gaussian: what the two columns of sizes hold.
 SIZE_NOTE = (

@@ -11,8 +11,10 @@ from functools import partial
 import pytest
 import torch
 
+from support.block_training import block_stage
 from support.cuda_on_host import ORDERS, HostDriver, barriers_of, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, near, turned
+from vdgs.config.method import BlockConfig, LossConfig
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import PROGRAM, SplatCapacity, decode, decode_for_training, expand_sources
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
@@ -22,6 +24,7 @@ from vdgs.kernels.kernel_types import AdamState, AnchorSplats, SplatGradients, S
 from vdgs.kernels.splat_segments import SplatMask
 from vdgs.kernels.torch_ref.decode import decode as reference
 from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_reference
+from vdgs.training.target import opacity_factors_at
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("not_for_a_card"), pytest.mark.xdist_group("cuda_decode")]
 
@@ -139,6 +142,19 @@ def test_for_training_splats_are_the_same_in_another_order(order, library):
     again = SplatMask.of(expected.source, len(rows), 10)
     assert torch.equal(again.bits, splats.source.bits)
     assert torch.equal(again.segments.lengths, splats.segments.lengths)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_noise_of_an_opacity_belongs_to_its_splat(order, library):
+    """Whichever block comes first: as on the processor, where splats stand in the order of anchors."""
+    stage, _ = block_stage(BlockConfig())
+    noisy = replace(stage, config=replace(stage.config, loss=LossConfig(opacity_noise=0.3)))
+    scene = Scene.random(141, 10)
+    splats, ordered = scattered(scene, turned(), library, order=order), decoded(scene, turned(), library)
+    found = opacity_factors_at(noisy, 3, splats)
+    expected = opacity_factors_at(noisy, 3, TrainingSplats.of(ordered))
+    assert torch.equal(found[splats.segments.order(len(splats.source))], expected)
 
 
 @needs_a_compiler

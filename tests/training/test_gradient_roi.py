@@ -80,9 +80,20 @@ class Masked(Photographs):
         return image, mask
 
 
+class Nothing(Photographs):
+    """Photographs of which no pixel counts."""
+
+    def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+        image, _ = super().get(index, downscale)
+        return image, torch.zeros(image.shape[:2], dtype=torch.uint8)
+
+
 def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, narrowing: bool) -> Stepped:
-    """The westernmost anchors, small, are the block; the others strew their Gaussians far over it and beyond."""
+    """The westernmost anchors, small, are the block; the others strew their Gaussians far over it and beyond. All hide
+    enough to show a surface."""
     anchors, decoder = coarse()
+    with torch.no_grad():
+        decoder.weights.opacity.b2.add_(1.5)
     west = anchors.positions[:, 0] < -2.6
     small = anchors.select(west)
     small = replace(small, log_scales=torch.full_like(small.log_scales, -2.0))
@@ -102,6 +113,10 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: TrainingProblem, own: bool, nar
     return Stepped(state, camera.width * camera.height, len(around.depths))
 
 
+def with_agreement(stage: TrainingProblem, weight: float) -> TrainingProblem:
+    return replace(stage, config=replace(stage.config, loss=replace(stage.config.loss, depth_agreement=weight)))
+
+
 def stages() -> dict[str, TrainingProblem]:
     stage, _ = block_stage(BlockConfig())
     return {
@@ -113,8 +128,10 @@ def stages() -> dict[str, TrainingProblem]:
 
 @pytest.mark.parametrize("name", stages())
 @pytest.mark.parametrize("own", [False, True], ids=["shared decoder", "own decoder"])
-def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
-    found, expected = (step(monkeypatch, stages()[name], own, narrowing) for narrowing in (True, False))
+@pytest.mark.parametrize("agreement", [0.0, 0.5], ids=["", "depths agree"])
+def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own, agreement):
+    stage = with_agreement(stages()[name], agreement)
+    found, expected = (step(monkeypatch, stage, own, narrowing) for narrowing in (True, False))
     assert found.pixels < 0.9 * expected.pixels
     assert 10 < found.around < expected.around
     ours, theirs = found.state, expected.state
@@ -128,6 +145,14 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
     assert float(theirs.statistics.gradient.max()) > 0
     for name in ("drawn", "opacity", "seen"):
         assert torch.equal(getattr(ours.statistics, name), getattr(theirs.statistics, name))
+
+
+@pytest.mark.parametrize("narrowing", [True, False])
+def test_a_photograph_of_which_nothing_counts_asks_for_no_growth(monkeypatch, narrowing):
+    stage = with_agreement(replace(stages()["whole"], images=Nothing()), 0.5)
+    state = step(monkeypatch, stage, True, narrowing).state
+    assert float(state.statistics.drawn.sum()) > 0
+    assert not state.statistics.gradient.any()
 
 
 def test_a_step_begins_its_pseudo_view_at_any_place_of_the_box(monkeypatch):

@@ -16,7 +16,7 @@ from vdgs.model.renderer import render
 from vdgs.training import train, training_loop
 from vdgs.training.depth_agreement import MIN_ALPHA, SMOOTH_BELOW, DepthAgreement, depth_agreement
 from vdgs.training.gradient_roi import crop_to_gradient_support
-from vdgs.training.target import opacity_factors_at
+from vdgs.training.target import background_at, opacity_factors_at
 from vdgs.training.training_step import render_for_training
 
 HEIGHT = 8.0
@@ -38,6 +38,27 @@ def test_gradients_are_those_of_the_loss() -> None:
     assert 0 < shown.double().mean() < 1
 
 
+def test_what_a_mask_leaves_out_takes_no_part() -> None:
+    """Whatever is drawn there; parts of a picture add up to the whole, by what each keeps of it."""
+    generator = torch.Generator().manual_seed(2)
+    alpha, depth, median = (0.5 + torch.rand(12, 9, generator=generator) / 2 for _ in range(3))
+    raster = Raster(torch.zeros(12, 9, 3), alpha, depth * 5, median * 5)
+    mask = (torch.rand(12, 9, generator=generator) < 0.4).byte()
+    found, plain = depth_agreement(raster, HEIGHT, mask), depth_agreement(raster, HEIGHT)
+    kept = mask.double().mean()
+    for name in ("alpha", "depth"):
+        ours, theirs = getattr(found, name), getattr(plain, name)
+        assert not ours[mask == 0].any()
+        torch.testing.assert_close(ours, (theirs * mask / kept).float())
+    total = torch.zeros(())
+    for rows in (slice(0, 5), slice(5, 12)):
+        part = depth_agreement(Raster(*(each[rows] for each in raster)), HEIGHT, mask[rows])  # type: ignore[arg-type]
+        total += part.loss * mask[rows].sum() / mask.sum()
+    torch.testing.assert_close(total, found.loss)
+    nothing = depth_agreement(raster, HEIGHT, torch.zeros_like(mask))
+    assert not any(each.any() for each in nothing)
+
+
 def test_training_with_it_draws_splats_to_one_depth() -> None:
     def spread(weight: float) -> float:
         stage, state = block_stage(BlockConfig())
@@ -52,7 +73,7 @@ def test_training_with_it_draws_splats_to_one_depth() -> None:
 
 
 def test_every_second_step_counts_it_twice_and_the_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    def one(raster: Raster, _: float) -> DepthAgreement:
+    def one(raster: Raster, *_: object) -> DepthAgreement:
         return DepthAgreement(torch.tensor(1.0), torch.zeros_like(raster.alpha), torch.zeros_like(raster.alpha))
 
     def losses(weight: float) -> list[float]:
@@ -71,9 +92,10 @@ def test_every_second_step_counts_it_twice_and_the_others_do_not(monkeypatch: py
 
 def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:
     stage, _ = block_stage(BlockConfig())
-    assert opacity_factors_at(stage, 3, 5) is None
+    splats = one_splat(0.3, times=10_000)
+    assert opacity_factors_at(stage, 3, splats) is None
     noisy = replace(stage, config=replace(stage.config, loss=LossConfig(opacity_noise=0.2)))
-    one, again, other = (opacity_factors_at(noisy, iteration, 10_000) for iteration in (3, 3, 4))
+    one, again, other = (opacity_factors_at(noisy, iteration, splats) for iteration in (3, 3, 4))
     assert one is not None
     assert other is not None
     assert again is not None
@@ -83,11 +105,26 @@ def test_opacities_vary_from_step_to_step_alike_for_a_seed() -> None:
     assert abs(float(one.std()) - 0.2) < 0.01
 
 
-def one_splat(opacity: float) -> TrainingSplats:
+def test_what_is_behind_a_step_says_nothing_of_its_opacities() -> None:
+    """Both are drawn anew in each step, neither from the numbers of the other."""
+    stage, _ = block_stage(BlockConfig())
+    loss = LossConfig(opacity_noise=0.2, random_background=1.0)
+    noisy, splats = replace(stage, config=replace(stage.config, loss=loss)), one_splat(0.3, times=16)
+
+    def drawn(step: int) -> list[float]:
+        factors = opacity_factors_at(noisy, step, splats)
+        assert factors is not None
+        return [float(background_at(noisy, step)[0]), abs(float(factors[0]) - 1)]
+
+    together = torch.tensor([drawn(step) for step in range(1000)]).T.corrcoef()
+    assert abs(float(together[0, 1])) < 0.1
+
+
+def one_splat(opacity: float, times: int = 1) -> TrainingSplats:
     return TrainingSplats(
-        means_px=torch.tensor([[9.0, 9.0]]), conics=torch.tensor([[0.1, 0.0, 0.1]]), depths=torch.ones(1),
-        colors=torch.ones(1, 3), opacities=torch.tensor([opacity]), segments=None,
-        source=torch.zeros(1, dtype=torch.int32), volume=torch.tensor(1.0),
+        means_px=torch.full((times, 2), 9.0), conics=torch.tensor([[0.1, 0.0, 0.1]]).repeat(times, 1),
+        depths=torch.ones(times), colors=torch.ones(times, 3), opacities=torch.full((times,), opacity), segments=None,
+        source=torch.arange(times, dtype=torch.int32), volume=torch.tensor(1.0),
     )  # fmt: skip
 
 

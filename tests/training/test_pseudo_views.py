@@ -36,7 +36,9 @@ def plane(camera: Camera) -> tuple[Raster, np.ndarray]:
 
 def target_of(index: int, mask: torch.Tensor | None = None) -> TrainingTarget:
     photographs = Photographs()
-    return TrainingTarget(image=photographs.get(index)[0], mask=mask, camera=photographs.camera(index))
+    camera = photographs.camera(index)
+    counted = camera.width * camera.height if mask is None else int(mask.count_nonzero())
+    return TrainingTarget(image=photographs.get(index)[0], mask=mask, camera=camera, counted_pixels=counted)
 
 
 def pseudo_view(index: int = 0, seed: int = 0) -> Camera:
@@ -104,7 +106,7 @@ def test_a_pixel_weighs_the_same_whatever_part_of_the_photograph_a_pseudo_view_i
     weights = []
     for seen in (whole, whole.cropped(4, 0, 44, 40), whole.cropped(14, 10, 34, 30)):
         image = torch.zeros(seen.height, seen.width, 3, dtype=torch.uint8)
-        target = TrainingTarget(image=image, mask=None, camera=seen, valid_fraction=0.5)
+        target = TrainingTarget(image=image, mask=None, camera=seen, counted_pixels=1, valid_fraction=0.5)
         camera = pseudo_camera(seen, plane(seen)[0], np.random.default_rng(0))
         assert camera is not None
         found = warp_photograph(target, plane(seen)[0], camera, plane(camera)[0], HEIGHT)

@@ -22,7 +22,8 @@ from vdgs.model.renderer import render
 from vdgs.partition.merging import merge_blocks
 from vdgs.training import TrainingState, from_checkpoint, initial_state, to_checkpoint
 from vdgs.training.sky_background import with_sky
-from vdgs.training.training_step import RenderedTrainingView, render_for_training
+from vdgs.training.target import TrainingTarget
+from vdgs.training.training_step import RenderedTrainingView, compute_loss, render_for_training
 
 TOWN = np.random.default_rng(0).uniform((-20, -20, 0), (20, 20, 2), (4000, 3))
 NOTHING = model_at(np.zeros((0, 3)))
@@ -136,7 +137,14 @@ def test_the_first_map_is_what_the_photographs_show() -> None:
     torch.testing.assert_close(straight_down[0, 0], torch.tensor([0.9, 0.1, 0.9]))
 
 
-def _drawn(envmap: torch.Tensor, opacity: float) -> RenderedTrainingView:
+def _target(camera: Camera, mask: torch.Tensor | None = None) -> TrainingTarget:
+    """A white photograph."""
+    white = torch.full((camera.height, camera.width, 3), 255, dtype=torch.uint8)
+    counted = camera.width * camera.height if mask is None else int(mask.count_nonzero())
+    return TrainingTarget(image=white, mask=mask, camera=camera, counted_pixels=counted)
+
+
+def _drawn(envmap: torch.Tensor, opacity: float, mask: torch.Tensor | None = None) -> RenderedTrainingView:
     """A splat larger than the picture before the map, in a step."""
     state, camera = start(TrainConfig(iterations=1)), level_camera(0.0)
     stage = replace(small_stage(), skylines=(find_skyline(camera.position, TOWN),))
@@ -147,7 +155,9 @@ def _drawn(envmap: torch.Tensor, opacity: float) -> RenderedTrainingView:
         source=torch.zeros(1, dtype=torch.int32), volume=torch.tensor(1.0),
     )  # fmt: skip
     background = torch.tensor([0.9, 0.2, 0.6])
-    return with_sky(render_for_training(splats, camera, background), stage, 0, decoder, camera, background)
+    return with_sky(
+        render_for_training(splats, camera, background), stage, 0, decoder, _target(camera, mask), background
+    )
 
 
 def test_gradients_are_finite_differences() -> None:
@@ -169,6 +179,32 @@ def test_gradients_are_finite_differences() -> None:
     # What lies below the skyline does not show the map.
     assert torch.equal(drawn.image[-1], _drawn(1 - envmap.detach(), 0.4).image[-1])
     assert not torch.equal(drawn.image[0], _drawn(1 - envmap.detach(), 0.4).image[0])
+
+
+def test_a_mask_makes_the_steps_of_the_map_no_larger() -> None:
+    """A cell moves as fast whatever share of the photograph counts, by pixels that count alone."""
+    whole, camera = torch.ones(48, 64, dtype=torch.uint8), level_camera(0.0)
+    right, tenth = whole.clone(), whole.clone()
+    right[:, :32] = 0
+    tenth[5:] = 0
+
+    def steps(mask: torch.Tensor | None) -> torch.Tensor:
+        envmap = torch.full((16, 64, 3), 0.5).requires_grad_()
+        drawn, decoder = _drawn(envmap, 0.1, mask), start(TrainConfig(iterations=1)).decoder
+        config = replace(TrainConfig(), loss=replace(TrainConfig().loss, ssim_lambda=0.0))
+        drawn.backward(compute_loss(drawn, _target(camera, mask), decoder, 0, config).image, 0.0)
+        return envmap.grad.sum(dim=-1)
+
+    plain = steps(None)
+    torch.testing.assert_close(steps(whole), plain)
+    for mask in (right, tenth):
+        found = steps(mask)
+        moved = found != 0
+        assert 0 < moved.sum() < (plain != 0).sum()
+        # Where enough of a cell shows.
+        largest = plain.min()
+        assert float(found.min()) == pytest.approx(float(largest), rel=0.05)
+    assert not steps(torch.zeros_like(whole)).any()
 
 
 def test_blocks_do_not_move_it() -> None:

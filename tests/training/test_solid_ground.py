@@ -148,6 +148,18 @@ def test_the_pixel_of_photographs_is_that_of_those_that_show_places_closest():
     assert photograph_pixel(points, []) == photograph_pixel(points[:0], [camera_at()]) == 0.0
 
 
+def test_photographs_of_several_sizes_count_by_their_own_pixels():
+    points = torch.from_numpy(np.random.default_rng(3).uniform(-8, 8, (400, 3)) * [1, 1, 0.5])
+    camera = camera_at()
+    alone = photograph_pixel(points, [camera])
+    # A large picture of a place far away does not make the pixels of this one smaller.
+    elsewhere = camera_at(9000.0).resized(20 * WIDTH, 20 * HEIGHT)
+    assert photograph_pixel(points, [camera, elsewhere]) == pytest.approx(alone, rel=1e-5)
+    # From half as high, in a quarter of the pixels: the picture from above shows smaller ones.
+    low, middle = camera_at(height=10.0).resized(WIDTH // 4, HEIGHT // 4), 0.1 * points
+    assert photograph_pixel(middle, [camera, low]) == pytest.approx(photograph_pixel(middle, [camera]), rel=1e-5)
+
+
 def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_cameras():
     beside = torch.tensor([[500.0, 0.0, 20.0]])
     bound = max_log_scales(beside, [camera_at(), camera_at(100.0)]).exp()

@@ -151,8 +151,8 @@ def make_visibility_map(coarse: OpenedRun) -> Callable[[Camera], np.ndarray]:
 
 
 def make_coverage_map(coarse: OpenedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
-    """Which pixels of a view show what enough training cameras see , by the coarse model's depth
-    whatever model is measured."""
+    """Which pixels of a view show what enough training cameras see, by the coarse model's depth whatever model is
+    measured."""
     cameras = [view.camera for view in coarse.capture.train_views]
     return coverage_map(lambda camera: render(coarse.model, camera, depth=True), cameras)
 

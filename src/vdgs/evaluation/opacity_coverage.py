@@ -138,6 +138,8 @@ def coverage_map(
     pixels continue the depth of the nearest solid ones, down to the ground but not up into the sky: beyond what cameras
     cover, half transparent splats lie at any depth (measured on a generated town). V drawn from anchors would not do:
     at the edge of what cameras cover, splats reach far beyond their anchors.
+
+    A floater of that model close before the view lies where few cameras look: what it covers is not seen.
     """
 
     def seen(camera: Camera) -> Bool[np.ndarray, "h w"]:

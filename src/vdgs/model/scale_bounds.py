@@ -34,39 +34,43 @@ MAX_IMAGE_FRACTION = 0.25
 MAX_OFFSET_FACTOR = 4.0
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
 MAX_SIGMA = math.sqrt(-2.0 * math.log(ALPHA_MIN))
-#: Share of the places that photographs show closest: the largest of their pixels is that of a scene.
+#: Share of the places that photographs show in the smallest pixels: the largest of these is the pixel of a scene.
 CLOSEST_SHARE = 0.1
 #: Cameras processed at once, to limit memory.
 CAMERA_CHUNK = 1024
 
 
-def max_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+def max_log_scales(
+    positions: Float[Tensor, "n 3"], cameras: Sequence[Camera], side_px: int | None = None
+) -> Float[Tensor, " n"]:
     """The logarithm of the largest standard deviation that Gaussians of anchors at these places may have, in units of
     the ground frame: what the nearest of the cameras (pinholes) that hold the place allows; where none holds it, the
-    nearest of all. Infinite without cameras. Time in proportion to what the cameras hold, O(n + c) memory."""
+    nearest of all. Infinite without cameras. With `side_px` as if the longer side of every picture were so many pixels
+    long. Time in proportion to what the cameras hold, O(n + c) memory."""
     bound = torch.full_like(positions[:, 0], math.inf)
     if len(positions) == 0 or not cameras:
         return bound.log()
     frusta = Frusta.of(cameras, positions.device)
+    extents = frusta.relative_extent if side_px is None else side_px / torch.maximum(frusta.fx, frusta.fy)
     for rows, cameras_in_view in SpatialGroups.of(positions).visible_groups(frusta):
         for some in cameras_in_view.split(CAMERA_CHUNK):
             selected = frusta.select(some)
             seen = selected.project(positions[rows])
-            allowed = torch.where(seen.inside, selected.relative_extent[:, None].to(positions) * seen.depth, math.inf)
+            allowed = torch.where(seen.inside, extents[some][:, None].to(positions) * seen.depth, math.inf)
             bound[rows] = torch.minimum(bound[rows], allowed.amin(dim=0))
     rows = bound.isinf().nonzero().squeeze(1)
-    bound[rows] = _by_nearest(positions[rows], cameras, frusta.relative_extent.cpu().numpy())
+    bound[rows] = _by_nearest(positions[rows], cameras, extents.cpu().numpy())
     return (bound * (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))).log()
 
 
 def photograph_pixel(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> float:
-    """The size of a pixel, in units of the ground frame, in the photograph that shows a place closest, for the closest
-    of the places (`CLOSEST_SHARE`; choice: one number for a scene, which blurs no photograph of it). 0 without cameras
-    or places."""
+    """The size of a pixel, in units of the ground frame, in the photograph that shows a place in the smallest pixels,
+    for the places shown in the smallest (`CLOSEST_SHARE`; choice: one number for a scene, which blurs photographs of
+    the few places that are shown in smaller ones). 0 without cameras or places."""
     if len(positions) == 0 or not cameras:
         return 0.0
-    spans = max_log_scales(positions, cameras).double().exp() / (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))
     longest = max(max(camera.width, camera.height) for camera in cameras)
+    spans = max_log_scales(positions, cameras, longest).double().exp() / (MAX_IMAGE_FRACTION / (2.0 * MAX_SIGMA))
     return float(np.quantile(spans.cpu().numpy(), CLOSEST_SHARE)) / longest
 
 

@@ -99,7 +99,8 @@ def decide_densification(
     the size of those of the finer one, for its own offsets and for those of the next coarser one that ask twice as
     strongly.
     Random numbers belong to offsets, not to policies: the same generator keeps the same offsets with compensation and
-    without.
+    without. With levels of anchors only up to where the first of these stops at another size of cells: it draws no
+    numbers for the smaller ones, and the next level goes on from there.
 
     Resets, in place, the gradient statistics of the offsets that were judged and the opacity statistics of the
     anchors that were, as upstream does; the others keep counting.

@@ -105,7 +105,10 @@ def warp_photograph(
     image = warped.round_().clamp_(0, 255).to(torch.uint8).contiguous()
     whole_width, whole_height = target.camera.full_size
     part = target.camera.width * target.camera.height / (whole_width * whole_height)
-    return TrainingTarget(image=image, mask=counts.to(torch.uint8), camera=camera, valid_fraction=share * part)
+    return TrainingTarget(
+        image=image, mask=counts.to(torch.uint8), camera=camera, counted_pixels=round(share * counts.numel()),
+        valid_fraction=share * part,
+    )  # fmt: skip
 
 
 def _places_in(seen: Camera, camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.scene_points import scene_points
-from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import RasterGradients
 from vdgs.model.decoder import Decoder
 from vdgs.model.envmap import ray_directions, sample_envmap
 from vdgs.model.initialization.sky import Skyline, above_skyline, find_skylines
+from vdgs.training.target import TrainingTarget
 from vdgs.training.training_state import TrainingProblem
 from vdgs.training.training_step import RenderedTrainingView
 
@@ -38,17 +38,17 @@ def view_skylines(capture: Capture, views: Sequence[View]) -> tuple[tuple[Skylin
 
 
 def with_sky(
-    drawn: RenderedTrainingView, stage: TrainingProblem, view: int, decoder: Decoder, camera: Camera,
+    drawn: RenderedTrainingView, stage: TrainingProblem, view: int, decoder: Decoder, target: TrainingTarget,
     background: Float[Tensor, "3"],
 ) -> RenderedTrainingView:  # fmt: skip
     """The view with the environment map of the decoder, where it has one and the view shows sky. Going backward leaves
-    in the `.grad` of the map how the loss changes with each of its cells: the mean over the pixels that show the cell,
-    in the loss of one pixel. Cells that show for less than a pixel count as if it were one: Adam would move them as
-    fast as the others, away from what no pixel holds."""
+    in the `.grad` of the map how the loss changes with each of its cells: the mean over the pixels that count and show
+    the cell, in the loss of one pixel. Cells that show for less than a pixel count as if it were one: Adam would move
+    them as fast as the others, away from what no pixel holds."""
     envmap, skyline = decoder.envmap, None if stage.skylines is None else stage.skylines[view]
     if envmap is None or skyline is None:
         return drawn
-    directions = ray_directions(camera, stage.device)
+    directions = ray_directions(target.camera, stage.device)
     # Rows without sky cost nothing more.
     shows = (directions[..., 2] > math.sin(float(skyline.min()))).any(dim=1).nonzero()[:, 0].tolist()
     if not shows:
@@ -70,9 +70,10 @@ def with_sky(
             alpha[part] -= (image[part] * difference).sum(-1)
             if envmap.requires_grad:
                 shown = through * (through >= MIN_SHOWN)
+                if target.mask is not None:
+                    shown *= target.mask[part, :, None] > 0
                 by_map = _spread(torch.cat([image[part] * shown, shown], dim=-1), directions, envmap)
-                width, height = camera.full_size
-                envmap.grad = by_map[..., :3] * (width * height) / by_map[..., 3:].clamp(min=1)
+                envmap.grad = by_map[..., :3] * target.counted_pixels / by_map[..., 3:].clamp(min=1)
         return drawn.pullback(image, alpha, depth, out=out, count=count)
 
     return replace(drawn, image=composed, pullback=pullback)

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import TrainingSplats
 from vdgs.kernels.transfer import upload
 from vdgs.model.anchors import Anchors
 from vdgs.training.crops import PixelBox, crop_at
@@ -17,6 +18,8 @@ from vdgs.training.training_state import TrainingImages, TrainingProblem
 
 #: Share of the steps that draw all levels of the anchors, whatever the size of their pixels (choice).
 ALL_LEVELS_SHARE = 0.5
+#: The stream of random numbers from which the noise of opacities is drawn.
+OPACITY_STREAM = 78
 
 
 def mean_image_color(
@@ -46,19 +49,19 @@ def background_at(stage: TrainingProblem, iteration: int) -> Tensor:
     return color.to(stage.device, non_blocking=True)
 
 
-def opacity_factors_at(stage: TrainingProblem, iteration: int, count: int) -> Float[Tensor, " m"] | None:
-    """Factors of the opacities of so many splats at this iteration, not negative; None without noise."""
+def opacity_factors_at(stage: TrainingProblem, iteration: int, splats: TrainingSplats) -> Float[Tensor, " m"] | None:
+    """Factors of the opacities of splats at this iteration, not negative; None without noise. The numbers follow the
+    order of anchors, in which a card need not write their splats."""
     deviation = stage.config.loss.opacity_noise
     if not deviation:
         return None
-    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
-    noise = (
-        torch.randn(count, generator=generator, dtype=torch.float32, device="cpu")
-        .mul_(deviation)
-        .add_(1.0)
-        .clamp_(min=0.0)
-    )
-    return noise.to(stage.device, non_blocking=True)
+    count = len(splats.opacities)
+    # Drawn on the CPU: the same numbers for any device.
+    drawn = np.random.default_rng((stage.config.seed, OPACITY_STREAM, iteration)).standard_normal(count, np.float32)
+    noise = upload(torch.from_numpy(drawn).mul_(deviation).add_(1.0).clamp_(min=0.0), stage.device)
+    if splats.segments is None:
+        return noise
+    return torch.empty_like(noise).scatter_(0, splats.segments.order(count).long(), noise)
 
 
 def levels_at(anchors: Anchors, seed: int, iteration: int) -> Anchors:
@@ -77,6 +80,8 @@ class TrainingTarget:
     #: 1 where a pixel counts; None: everywhere.
     mask: UInt8[Tensor, "h w"] | None
     camera: Camera
+    #: How many pixels of the whole photograph count.
+    counted_pixels: int
     #: The share of the photograph's pixels that count in this part. Gradients are multiplied by it: those of a mean
     #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
     #: SSIM within its window of the part's border, where it sees nothing beyond).
@@ -102,6 +107,7 @@ def make_target(stage: TrainingProblem, view: int, downscale: int, box: PixelBox
         image=stage.copies.part(image, inside, stage.device),
         mask=None if mask is None else upload(mask, stage.device),
         camera=camera,
+        counted_pixels=of_whole,
         valid_fraction=share,
     )
 

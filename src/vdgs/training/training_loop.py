@@ -98,7 +98,7 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
     background, with_pseudo_view = background_at(stage, iteration), is_pseudo_view_due(config, iteration)
     with torch.no_grad():
         splats = decode_anchors_for_training(state.anchors, rows, weights, camera)
-        factors = opacity_factors_at(stage, iteration, len(splats.source))
+        factors = opacity_factors_at(stage, iteration, splats)
         if not with_pseudo_view:  # which begins at any place of the box, on any device
             box = crop_to_gradient_support(stage, splats, camera, box, factors)
         target = make_target(stage, view, downscale, box)
@@ -107,13 +107,13 @@ def train_step(state: TrainingState, stage: TrainingProblem) -> StepReport:
             splats, target.camera, background, frozen, depth=with_pseudo_view or is_agreement_due(config, iteration),
             opacity_factors=factors,
         )  # fmt: skip
-    drawn = with_sky(drawn, stage, view, state.decoder, target.camera, background)
+    drawn = with_sky(drawn, stage, view, state.decoder, target, background)
     weight = stage.loss_weight
     compared = compute_loss(drawn, target, state.decoder, image_index_at(stage, view), config, weight)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    if (agreement := _weighted_agreement(drawn, stage, iteration, target.valid_fraction)) is not None:
+    if (agreement := _weighted_agreement(drawn, stage, iteration, target)) is not None:
         loss = loss + agreement.loss
     values = torch.stack([loss, compared.l1, compared.ssim])
     if is_host(values):  # before anything moves
@@ -241,13 +241,14 @@ def image_index_at(stage: TrainingProblem, view: int) -> int:
 
 
 def _weighted_agreement(
-    drawn: RenderedTrainingView, stage: TrainingProblem, iteration: int, valid_fraction: float
+    drawn: RenderedTrainingView, stage: TrainingProblem, iteration: int, target: TrainingTarget
 ) -> DepthAgreement | None:
     """The loss of depths and its gradients, scaled to the whole photograph; None where none is due."""
-    weight = AGREEMENT_EVERY * stage.loss_weight * stage.config.loss.depth_agreement * valid_fraction
+    weight = AGREEMENT_EVERY * stage.loss_weight * stage.config.loss.depth_agreement * target.valid_fraction
     if not (weight and is_agreement_due(stage.config, iteration) and len(drawn.source)):
         return None
-    return DepthAgreement(*(weight * part for part in depth_agreement(drawn.raster, stage.camera_height)))
+    found = depth_agreement(drawn.raster, stage.camera_height, target.mask)
+    return DepthAgreement(*(weight * part for part in found))
 
 
 def _volume_weight(stage: TrainingProblem) -> float:
