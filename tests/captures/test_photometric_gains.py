@@ -192,6 +192,14 @@ def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
     assert colors.gain_spread() < 0.007
 
 
+def test_points_of_a_photograph_that_is_not_compared_and_of_one_other_say_nothing():
+    """Three points that only the first and the last show: too few for the last, and then of the first alone."""
+    renumbered = numbered(lambda _, numbers: np.concatenate([10**6 + np.arange(3), numbers[3:]]))
+    last = replace(renumbered[7], observations=part(renumbered[7].observations, slice(0, 3)))
+    colors = looked_at(Photographed(NONE, [renumbered[0], *VIEWS[1:7], last]))
+    assert (np.bincount(colors.point) > 1).all()
+
+
 @pytest.mark.parametrize(
     "views",
     [
