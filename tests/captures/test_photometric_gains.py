@@ -100,6 +100,14 @@ def test_gains_are_found_whatever_the_place_looks_like(seed, size):
     assert 0.6 * of_uniform - 0.01 < colors.gain_spread() < 1.2 * of_uniform + 0.01
 
 
+def test_gains_are_found_where_pixels_are_not_square():
+    cameras = {name: replace(camera, fy=1.4 * camera.fy) for name, camera in SCENE.cameras.items()}
+    gains = some_gains(3)
+    found = gains_of(Photographed(gains, views_of(replace(SCENE, cameras=cameras))))
+    assert np.abs(found - gains).max() < 0.03
+    assert looked_at(Photographed(NONE, views_of(replace(SCENE, cameras=cameras)))).gain_spread() < 0.007
+
+
 def test_photographs_of_one_exposure_are_equally_bright():
     assert looked_at(Photographed(NONE)).gain_spread() < 0.007 < SPREAD
 
