@@ -14,8 +14,9 @@ from support.blocks_files import ORIENTATIONS, PLAIN, blocks_xml, in_system
 from support.captures import write_ply
 from support.true_flight import ORIGIN, SIZE, TrueFlight, assert_read_or_refused, assert_true, true_flight
 from vdgs.captures.formats import blocks_exchange
+from vdgs.captures.formats.block_rotations import TwoWays, told_by_points
 from vdgs.captures.formats.lens_projection import ray_pixels
-from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture
 from vdgs.captures.loading import read_files
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -338,3 +339,15 @@ def test_several_projects_of_a_folder_are_named(tmp_path, flight):
     with pytest.raises(CaptureError, match=r"several projects \(one\.xml, two\.xml\)"):
         read_files(tmp_path, OPTIONS)
     assert_true(read_files(tmp_path / "two.xml", OPTIONS), flight)
+
+
+def test_a_way_that_puts_tie_points_behind_the_camera_is_not_the_one():
+    """From behind, points fall on the same pixels."""
+    lens = Intrinsics("PINHOLE", (800.0, 800.0, 400.0, 300.0), 800, 600)
+    ahead = np.array([[0.5, 0.2, 4.0], [-1.0, 0.4, 5.0], [0.3, -0.6, 3.0]])
+    pixels = ray_pixels(lens, ahead[:, :2] / ahead[:, 2:])
+    for way in (0, 1):
+        points = (ahead, -ahead) if way == 0 else (-ahead, ahead)
+        found, errors = told_by_points([TwoWays(lens, (np.eye(4), np.eye(4)), points, pixels)])
+        assert found == way
+        assert errors[1 - way] == np.inf

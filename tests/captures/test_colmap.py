@@ -67,6 +67,21 @@ def test_models_written_by_pycolmap_are_read(tmp_path, text):
     np.testing.assert_allclose(np.sort(model.points, axis=0), np.sort(points, axis=0), atol=1e-9)
 
 
+def test_points_in_any_order_are_found_by_their_numbers_and_lost_ones_are_not(tmp_path):
+    """As in models whose points were merged, and of which some were deleted."""
+    scene = tiny_scene()
+    folder = write_colmap(tmp_path, scene, text=True, images=None, tracks=True)
+    file, lost = folder / "points3D.txt", {3, 17, len(scene.points)}
+    head, *lines = file.read_text().splitlines()
+    kept = [line for line in reversed(lines) if int(line.split()[0]) not in lost]
+    file.write_text("\n".join([head, *kept]) + "\n")
+    for view in read_colmap(folder).views:
+        numbers = np.flatnonzero(scene.cameras[view.name].in_frustum(scene.points)) + 1
+        assert view.observations is not None
+        np.testing.assert_array_equal(np.sort(view.observations.point_ids), [k for k in numbers if k not in lost])
+        np.testing.assert_allclose(view.observations.points, scene.points[view.observations.point_ids - 1])
+
+
 def test_camera_models_agree_with_pycolmap():
     for identifier, (name, parameters) in CAMERA_MODELS.items():
         camera = pycolmap.Camera.create_from_model_name(1, name, 100.0, 200, 100)

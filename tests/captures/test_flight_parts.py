@@ -48,6 +48,19 @@ def test_strips_and_obliques_are_found() -> None:
     assert oblique_views(views) == list(range(30, 36))
 
 
+@pytest.mark.parametrize(("gap", "tilt"), [(50.0, 3.0), (10.0, 45.0)])
+def test_a_strip_ends_at_a_jump_and_where_the_camera_tilts(gap: float, tilt: float) -> None:
+    views = [view(k, 10.0 * k + (gap - 10.0) * (k > 5), 0.0, tilt if k > 5 else 3.0) for k in range(12)]
+    assert flight_strips(views) == [[*range(6)], [*range(6, 12)]]
+
+
+def test_a_circle_is_no_strip_however_slowly_it_turns() -> None:
+    """By 12 degrees each step: by 30 after five."""
+    turns = np.radians(12.0 * np.arange(60))
+    views = [view(k, 50 * np.cos(turn), 50 * np.sin(turn), 3.0) for k, turn in enumerate(turns)]
+    assert max(map(len, flight_strips(views))) < 10
+
+
 def test_whole_strips_are_left_out() -> None:
     test, train = sides_of(flight(0), split="strips")
     assert test == set(range(12, 18))

@@ -235,3 +235,19 @@ def test_damaged_files_end_in_a_picture_or_in_an_error_that_names_them(tmp_path,
                 complaints += 1
                 assert file.name in str(error)  # noqa: PT017
     assert complaints > 10
+
+
+def test_what_is_half_transparent_counts_from_the_middle_on(tmp_path):
+    pixels = np.full((1, 4, 4), 200, np.uint8)
+    pixels[0, :, 3] = [0, 127, 128, 255]
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    _, opaque = decode_image(tmp_path / "a.png")
+    assert opaque is not None
+    assert opaque.tolist() == [[False, False, True, True]]
+
+
+def test_masks_of_zeros_and_ones_are_masks(tmp_path):
+    """As label programs write them; beside 255, 1 is black."""
+    for white in (1, 255):
+        Image.fromarray(np.array([[0, 1, white]], np.uint8)).save(tmp_path / "m.png")
+        assert decode_mask(tmp_path / "m.png", 3, 1).tolist() == [[False, white == 1, True]]

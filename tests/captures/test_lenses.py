@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from vdgs.captures.formats.brown_lens import (
+    _bent,
+    _slopes,
     brown_intrinsics,
     brown_pinhole,
     fisheye_intrinsics,
@@ -112,15 +114,32 @@ def test_where_a_lens_folds_over_there_is_no_ray():
         undistorted_pinhole(folded)
 
 
+@pytest.mark.parametrize("center", [(502.5, 372.5), (490.0, 384.0)])
 @pytest.mark.parametrize("tail", [(-0.1, 0.03, 0.001, -0.002), (0.05, -0.01, 0.0, 0.0)])
-def test_the_undistorted_camera_and_the_way_to_it_are_those_of_colmap(tail):
-    opencv = Intrinsics("OPENCV", (750.0, 752.5, 502.5, 372.5, *tail), 1000, 750)
+def test_the_undistorted_camera_and_the_way_to_it_are_those_of_colmap(tail, center):
+    opencv = Intrinsics("OPENCV", (750.0, 752.5, *center, *tail), 1000, 750)
     brown = Intrinsics(BROWN, (*opencv.params, 0.0, 0.0, 0.0), 1000, 750)
     pinhole = undistorted_pinhole(opencv)
     found = brown_pinhole(brown)
     assert (found.width, found.height) == (pinhole.width, pinhole.height)
     np.testing.assert_allclose(found.params, pinhole.params, atol=1e-9)
     np.testing.assert_allclose(sampling_map(brown, found), sampling_map(opencv, pinhole), atol=2.5e-4)
+
+
+def test_a_picture_without_distortion_stays_where_it_is():
+    lens = Intrinsics("PINHOLE", (75.0, 76.0, 50.25, 37.5), 100, 75)
+    rows, columns = np.mgrid[:75, :100]
+    np.testing.assert_allclose(sampling_map(lens, lens), np.stack([columns, rows], axis=-1), atol=1e-5)
+
+
+def test_the_slopes_of_lenses_are_finite_differences():
+    """Newton's method finds rays with slopes that are a little off, too, only later."""
+    rays, step = np.random.default_rng(2).uniform(-0.6, 0.6, (200, 2)), 1e-6
+    for lens in (LENS, GROWING, FISHEYE):
+        found = np.stack(_slopes(lens, rays), axis=1).reshape(-1, 2, 2)
+        for axis, change in enumerate(np.eye(2) * step):
+            slope = (_bent(lens, rays + change) - _bent(lens, rays - change)) / (2 * step)
+            np.testing.assert_allclose(found[:, :, axis], slope, atol=1e-8)
 
 
 @pytest.mark.parametrize("lens", [LENS, GROWING])

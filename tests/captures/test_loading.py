@@ -19,7 +19,7 @@ from vdgs.captures import undistortion
 from vdgs.captures.formats.source_capture import Intrinsics, SourceView
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_checks import check_images
-from vdgs.captures.image_files import decode_image
+from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.captures.image_matching import fit_to_image, scale_intrinsics
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import input_folders
@@ -403,6 +403,24 @@ def test_the_map_of_a_lens_is_made_once_for_all_its_photographs(tmp_path, monkey
         assert decode_image(photo.path)[0].shape[1::-1] == (photo.intrinsics.width, photo.intrinsics.height)
     assert undistortion.undistort(tmp_path / "straight", photographs) == straight
     assert asked == lenses
+
+
+def test_the_mask_of_a_straightened_photograph_holds_what_its_mask_and_it_show(tmp_path, monkeypatch):
+    """Neither what is transparent, nor what is masked, nor, of a wider picture, what lies beside the photograph."""
+    lens, wide = Intrinsics("SIMPLE_RADIAL", (58.0, 32.0, 24.0, -1e-6), 64, 48), (58.0, 58.0, 48.0, 24.0)
+    picture = np.full((48, 64, 4), 255, np.uint8)
+    picture[:16, :, 3] = 0
+    masked = np.full((48, 64), 255, np.uint8)
+    masked[32:] = 0
+    image, mask = tmp_path / "a.png", tmp_path / "a.mask.png"
+    assert cv2.imwrite(str(image), picture)
+    assert cv2.imwrite(str(mask), masked)
+    monkeypatch.setattr(undistortion, "undistorted_pinhole", lambda _: Intrinsics("PINHOLE", wide, 96, 48))
+    (straight,) = undistortion.undistort(tmp_path / "straight", [ImageFile("a.png", image, mask, lens)])
+    expected = np.zeros((48, 96), bool)
+    expected[16:32, 16:80] = True
+    assert straight.mask is not None
+    np.testing.assert_array_equal(decode_mask(straight.mask, 96, 48), expected)
 
 
 def test_a_damaged_photograph_has_no_sound_copy(tmp_path):

@@ -15,6 +15,9 @@ from PIL import Image
 
 from support.captures import write_ply
 from support.metashape_files import (
+    CHUNK_ORIGIN,
+    CHUNK_ROTATION,
+    CHUNK_SCALE,
     INITIAL,
     LOCAL,
     WGS84,
@@ -66,6 +69,13 @@ def test_a_georeferenced_chunk_is_read_exactly(tmp_path, lens):
     assert source.georef.method == "Metashape, WGS 84"
     assert source.original_images
     np.testing.assert_allclose(source.georef.origin[:2], ORIGIN[:2], atol=0.01)
+
+
+def test_the_transform_of_old_files_is_one_matrix(tmp_path):
+    flight, matrix = true_flight(), np.eye(4)
+    matrix[:3] = np.column_stack([CHUNK_SCALE * CHUNK_ROTATION, CHUNK_ORIGIN])
+    xml = metashape_xml(flight, reference=LOCAL, transform=f"<transform>{words(matrix)}</transform>")
+    assert_true(read(tmp_path, xml, flight), flight)
 
 
 def test_a_projected_system_of_the_chunk_does_not_matter_for_its_place(tmp_path):

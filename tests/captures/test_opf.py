@@ -20,6 +20,7 @@ from support.known_flight import (
 from support.project_reading import check_numbers, known_points, read
 from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.formats import opf
+from vdgs.captures.formats.gltf_points import read_gltf_points
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -177,3 +178,32 @@ def test_opf_without_calibration_and_with_missing_files_says_so(tmp_path: Path, 
     file.write_text(json.dumps(content))
     with pytest.raises(CaptureError, match="not calibrated"):
         read(tmp_path, "opf")
+
+
+@pytest.mark.parametrize(("component", "dtype", "most"), [(5121, "u1", 255), (5123, "<u2", 65535), (5126, "<f4", 1.0)])
+def test_colors_of_points_are_the_same_in_every_kind_of_number(tmp_path: Path, component: int, dtype: str, most: float):
+    """Of glTF all run from black, 0, to white: the largest integer, or 1."""
+    levels = np.array([[0, 1, 127], [128, 254, 255]])
+    scaled = levels * (most / 255)
+    buffers = {"places": np.zeros((2, 3), "<f4"), "colors": (scaled if most == 1 else np.rint(scaled)).astype(dtype)}
+    for name, values in buffers.items():
+        (tmp_path / f"{name}.bin").write_bytes(values.tobytes())
+    content = {
+        "nodes": [{"mesh": 0}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}}]}],
+        "accessors": [{"bufferView": k, "componentType": kind, "count": 2, "type": "VEC3"}
+                      for k, kind in enumerate((5126, component))],
+        "bufferViews": [{"buffer": k} for k in range(2)], "buffers": [{"uri": f"{name}.bin"} for name in buffers],
+    }  # fmt: skip
+    (tmp_path / "points.gltf").write_text(json.dumps(content))
+    np.testing.assert_array_equal(read_gltf_points(tmp_path / "points.gltf").colors, levels)
+
+
+def test_points_whose_sightings_begin_beyond_four_bytes_say_so(tmp_path: Path, flight: KnownFlight) -> None:
+    """A beginning has five bytes, of which the last is no part of the length."""
+    writers.write_opf(tmp_path, flight)
+    ranges = tmp_path / "point_cloud" / "ranges.bin"
+    held = bytearray(ranges.read_bytes())
+    held[4] = 1
+    ranges.write_bytes(held)
+    with pytest.raises(CaptureError, match="is no point cloud of OPF"):
+        read_gltf_points(tmp_path / "point_cloud" / "sparse.gltf")

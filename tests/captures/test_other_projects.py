@@ -229,6 +229,15 @@ def test_visualsfm_is_read_to_its_numbers(tmp_path: Path, radial: float, matrix:
     check_tie_points(read(tmp_path, "visualsfm"), flight)
 
 
+def test_a_calibration_that_visualsfm_held_is_read_to_its_numbers(tmp_path: Path) -> None:
+    flight = known_flight(MeasuredLens(radial=0.0))
+    flight.write_photographs(tmp_path / "images")
+    file = writers.write_visualsfm(tmp_path, flight)
+    file.write_text(file.read_text().replace("NVM_V3 \n", "NVM_V3 FixedK 700 401 710 302 0\n", 1))
+    lens = read(tmp_path, "visualsfm").views[0].intrinsics
+    assert (lens.focal, lens.principal_point) == ((700.0, 710.0), (401.0, 302.0))
+
+
 def test_a_lens_of_visualsfm_that_folds_over_is_named(tmp_path: Path) -> None:
     flight = known_flight(MeasuredLens(radial=0.0))
     flight.write_photographs(tmp_path / "images")
@@ -276,6 +285,30 @@ def test_meshroom_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight, ve
     writers.write_alicevision(tmp_path, flight, version)
     flight.write_photographs(tmp_path / "images")
     check_tie_points(read(tmp_path, "alicevision"), flight)
+
+
+@pytest.mark.parametrize(
+    ("version", "told"),
+    [
+        ((1, 2, 0), {"pxFocalLength": ["700", "707"]}),
+        ((1, 2, 1), {"pxFocalLength": ["700", "707"]}),
+        ((1, 2, 4), {"focalLength": "31.5", "pixelRatio": str(1 / 1.01)}),
+        ((1, 2, 5), {"focalLength": "31.5", "pixelRatio": "1.01"}),
+    ],
+)
+def test_each_version_of_meshroom_counts_focal_lengths_and_principal_points_its_own_way(
+    tmp_path: Path, flight: KnownFlight, version: tuple[int, int, int], told: dict[str, str | list[str]]
+) -> None:
+    """Before 1.2.1 the principal point is from the corner, before 1.2.2 the focal length in pixels; `pixelRatio` is
+    that of the pixels, before 1.2.5 of the focal lengths."""
+    file = writers.write_alicevision(tmp_path, flight, version)
+    flight.write_photographs(tmp_path / "images")
+    content = json.loads(file.read_text())
+    content["intrinsics"][0] |= told
+    file.write_text(json.dumps(content))
+    lens = read(tmp_path, "alicevision").views[0].intrinsics
+    assert lens.focal == pytest.approx((700.0, 707.0))
+    assert lens.principal_point == pytest.approx(flight.lens.center)
 
 
 def test_photographs_of_a_rig_of_meshroom_have_its_pose_and_then_their_cameras(
@@ -455,6 +488,18 @@ def test_list_of_bundler_must_name_every_camera(tmp_path: Path, flight: KnownFli
         read(tmp_path, "bundler")
     (tmp_path / "export.imagelist").write_text("".join(f"C:\\card\\{name}\n" for name in flight.names))
     assert len(read(tmp_path, "bundler").views) == len(flight.names)
+
+
+def test_names_in_the_list_of_bundler_may_hold_blanks(tmp_path: Path, flight: KnownFlight) -> None:
+    """Bundler itself writes a guess of the focal length behind each."""
+    flight = replace(flight, names=[f"flight 1/DJI {k}.jpg" for k in range(len(flight.names))])
+    writers.write_bundler(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    assert [view.name for view in read(tmp_path, "bundler").views] == sorted(flight.names)
+    plain = replace(flight, names=[name.replace(" ", "_") for name in flight.names])
+    plain.write_photographs(tmp_path / "images")
+    (tmp_path / "list.txt").write_text("".join(f"images/{name} 0 700.5\n" for name in plain.names))
+    assert [view.name for view in read(tmp_path, "bundler").views] == sorted(plain.names)
 
 
 def _all_formats(root: Path, flight: KnownFlight) -> list[tuple[str, Path]]:

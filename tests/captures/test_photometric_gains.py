@@ -100,6 +100,14 @@ def test_gains_are_found_whatever_the_place_looks_like(seed, size):
     assert 0.6 * of_uniform - 0.01 < colors.gain_spread() < 1.2 * of_uniform + 0.01
 
 
+def test_gains_are_found_where_pixels_are_not_square():
+    cameras = {name: replace(camera, fy=1.4 * camera.fy) for name, camera in SCENE.cameras.items()}
+    gains = some_gains(3)
+    found = gains_of(Photographed(gains, views_of(replace(SCENE, cameras=cameras))))
+    assert np.abs(found - gains).max() < 0.03
+    assert looked_at(Photographed(NONE, views_of(replace(SCENE, cameras=cameras)))).gain_spread() < 0.007
+
+
 def test_photographs_of_one_exposure_are_equally_bright():
     assert looked_at(Photographed(NONE)).gain_spread() < 0.007 < SPREAD
 
@@ -190,6 +198,14 @@ def test_a_photograph_that_shares_hardly_a_point_is_not_compared():
     colors = looked_at(Photographed(gains, lost))
     assert sorted(colors.gains()) == [index for index in range(len(VIEWS)) if index != 7]
     assert colors.gain_spread() < 0.007
+
+
+def test_points_of_a_photograph_that_is_not_compared_and_of_one_other_say_nothing():
+    """Three points that only the first and the last show: too few for the last, and then of the first alone."""
+    renumbered = numbered(lambda _, numbers: np.concatenate([10**6 + np.arange(3), numbers[3:]]))
+    last = replace(renumbered[7], observations=part(renumbered[7].observations, slice(0, 3)))
+    colors = looked_at(Photographed(NONE, [renumbered[0], *VIEWS[1:7], last]))
+    assert (np.bincount(colors.point) > 1).all()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from support.captures import write_ply
 from support.dataset_layouts import write_transforms
+from vdgs.captures.formats import las_reader
 from vdgs.captures.formats.ply_reader import GRAY, read_point_cloud
 from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError
@@ -160,3 +161,22 @@ def test_points_without_colors_are_remarked(tmp_path, scene):
         text = text.replace("\n1 2 3 ", f"\n{k % 7} {k % 5} {k / 100} ", 1)
     (tmp_path / "sparse_pc.ply").write_text(text)
     assert any("bring no colors" in warning for warning in load_capture(tmp_path).warnings)
+
+
+def test_colors_of_sixteen_bits_are_those_of_eight_exactly(tmp_path):
+    levels = np.arange(256)[:, None].repeat(3, axis=1)
+    file = cloud(tmp_path / "a.ply", ("red", "green", "blue"), "ushort", 257 * levels, "binary_little_endian")
+    np.testing.assert_array_equal(read_point_cloud(file)[1], levels)
+
+
+@pytest.mark.parametrize("chunk", [7, 25, 1000])
+def test_clouds_are_thinned_evenly_however_they_are_read(tmp_path, monkeypatch, chunk):
+    laspy = pytest.importorskip("laspy")
+    written = laspy.LasData(laspy.LasHeader(version="1.4", point_format=7))
+    written.header.scales = np.full(3, 0.01)
+    written.x, written.y, written.z = np.arange(100) * np.array([[1.0], [0.0], [0.0]])
+    written.write(tmp_path / "a.las")
+    monkeypatch.setattr(las_reader, "MAX_POINTS", 20)
+    monkeypatch.setattr(las_reader, "_CHUNK", chunk)
+    points, _ = las_reader.read_las_points(tmp_path / "a.las")
+    np.testing.assert_allclose(points[:, 0], np.arange(0, 100, 5))

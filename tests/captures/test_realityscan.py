@@ -19,6 +19,7 @@ from support.known_flight import (
 )
 from support.project_reading import check_numbers, read
 from vdgs.captures.formats import realityscan
+from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu
@@ -235,3 +236,18 @@ def test_rows_that_cannot_be_read_are_told_all_at_once(tmp_path: Path, flight: K
     file.write_text("\n".join(lines))
     with pytest.raises(CaptureError, match=r"2 of its rows(.|\n)*line 3(.|\n)*line 6"):
         read(tmp_path, "realityscan")
+
+
+def test_skew_and_aspect_of_xmp_are_read_to_their_numbers(tmp_path: Path, flight: KnownFlight) -> None:
+    """RealityScan counts the skew, like the principal point, in shares of the longer side."""
+    flight.write_photographs(tmp_path / "images")
+    writers.write_realityscan_xmp(tmp_path / "images", flight)
+    for file in (tmp_path / "images").rglob("*.xmp"):
+        text = file.read_text().replace('xcr:Skew="0"', 'xcr:Skew="0.002"')
+        file.write_text(text.replace('xcr:AspectRatio="1"', 'xcr:AspectRatio="1.01"'))
+    lens = flight.lens
+    bent = brown_intrinsics(
+        (lens.focal, 1.01 * lens.focal), lens.center, lens.size, lens.k, lens.p, 0.002 * max(lens.size)
+    )
+    view = read(tmp_path, "realityscan").views[0]
+    np.testing.assert_allclose(view.intrinsics.params, bent.params, rtol=1e-9)

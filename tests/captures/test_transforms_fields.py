@@ -6,6 +6,7 @@ import contextlib
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -168,3 +169,21 @@ def test_a_transposed_pose_is_refused(tmp_path):
     assert np.array_equal(parse_matrix(place.tolist(), tmp_path, "frame 1"), place)
     with pytest.raises(CaptureError, match=r"frame 1 has a matrix whose last row is not 0 0 0 1\. It seems transposed"):
         parse_matrix(place.T.tolist(), tmp_path, "frame 1")
+
+
+def test_both_angles_stand_in_for_both_focal_lengths(tmp_path):
+    angles = {"camera_angle_x": 2 * np.arctan(400 / 2 / 500.0), "camera_angle_y": 2 * np.arctan(300 / 2 / 520.0)}
+    lens = parse_intrinsics({}, {"w": 400, "h": 300, **angles}, tmp_path / "a.png", tmp_path / "transforms.json")
+    assert lens.focal == pytest.approx((500.0, 520.0))
+
+
+def test_the_mask_that_a_frame_names_counts_before_one_in_the_folder_of_masks(tmp_path, scene):
+    content = write_transforms(tmp_path, scene)
+    name = Path(content["frames"][0]["file_path"]).name
+    for folder in ("masks", "mine"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / name), np.full((48, 64), 255, np.uint8))
+    content["frames"][0]["mask_path"] = f"mine/{name}"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    masks = {view.name: view.mask_path for view in load_capture(tmp_path).views}
+    assert masks[name] == tmp_path / "mine" / name

@@ -130,6 +130,17 @@ def test_subtitles_without_times_say_nothing(text):
     assert read_subtitles(text) == []
 
 
+def test_fractions_of_seconds_of_subtitles_have_one_to_three_digits():
+    times = ("00:00:01,5", "00:01:00.25", "01:00:00,125")
+    text = "\n\n".join(f"{k}\n{time} --> {time}\n" for k, time in enumerate(times, 1))
+    assert [seconds for seconds, _ in read_subtitles(text)] == [1.5, 60.25, 3600.125]
+
+
+def test_the_moment_of_a_frame_is_that_of_the_record_before_it_and_the_time_since():
+    records = read_telemetry([(1.0, "2026-06-01 10:00:07.500 [latitude: 47.0] [longitude: 8.0]")])
+    assert telemetry_at(records, 1.25).moment == datetime(2026, 6, 1, 10, 0, 7, 750_000)
+
+
 def test_positions_lie_between_those_of_the_records_and_are_not_made_up():
     text = "1\n00:00:01,000 --> 00:00:02,000\n{a}\n\n2\n00:00:02,000 --> 00:00:03,000\n{b}\n"
     a, b = ("[latitude: 47.0] [longitude: 8.0] [rel_alt: 10.0]", "[latitude: 47.1] [longitude: 8.4] [rel_alt: 20.0]")
@@ -188,6 +199,21 @@ def test_the_step_grows_where_a_film_goes_far():
     assert {Path(str(place)) for place in chosen} == written
     assert len(chosen) == 10
     assert np.diff(chosen).max() <= 2 * chosen[-1] / 9
+
+
+@pytest.mark.parametrize("most", [3, 4, 10, 25])
+def test_no_mark_is_taken_twice_where_the_step_grows(most: int):
+    """Of frames of one sharpness those on the marks are taken, which in the end are two steps apart."""
+    written = set[Path]()
+
+    def keep(place: float) -> Path:
+        written.add(Path(f"{place:.1f}"))
+        return Path(f"{place:.1f}")
+
+    chooser = FrameChooser[float](most, keep, written.remove)
+    for k in range(10 * (2 * most + 4)):
+        chooser.offer(k * STEP / 10, 1.0, k / 10)
+    assert sorted(float(str(place)) for place in written) == [2.0 * mark for mark in range(most + 2)]
 
 
 def test_motion_is_measured_also_after_cuts_and_over_water():

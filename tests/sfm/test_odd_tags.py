@@ -204,6 +204,19 @@ def test_positions_of_another_datum_are_converted_or_their_error_is_stated(datum
 
 
 @pytest.mark.parametrize(
+    ("datum", "place", "seconds"),
+    [
+        ("TOKYO", (35.6, 139.7), (11.6, -11.6)),
+        ("ED50", (48.0, 8.0), (-3.2, -4.3)),
+        ("NAD27", (40.0, -100.0), (0.1, -1.4)),
+    ],
+)
+def test_positions_are_converted_from_their_datum_and_not_to_it(datum, place, seconds):
+    found, _, _ = to_wgs84(place, {0x12: datum})
+    assert 3600 * np.subtract(found, place) == pytest.approx(seconds, abs=0.7)
+
+
+@pytest.mark.parametrize(
     ("own", "name", "is_measured"),
     [(True, "drone-dji:GpsL", True), (True, "exif:GPSL", False), (False, "exif:GPSL", True)],
 )

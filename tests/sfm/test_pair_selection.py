@@ -123,3 +123,26 @@ def test_how_a_photograph_looks_does_not_depend_on_how_many_there_are(monkeypatc
     assert of_few > of_all - 0.1
     assert of_all > 0.9
     assert pair_selection.retrieval_pairs(lambda _: looks[3], 5, range(5)) == set()
+
+
+def test_cameras_of_one_place_that_look_four_ways_do_not_share_it():
+    """Of a walk with four cameras: each is matched with the next that look its way, not with three times as many."""
+    ways = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    places, directions = np.repeat(np.arange(30), 4), np.tile(ways, (30, 1))
+    positions = np.stack([places, 0 * places, 0 * places], axis=1).astype(float)
+    chosen = pair_selection.spatial_pairs(positions, 4, directions)
+    apart = [places[j] - places[i] for i, j in chosen if (j - i) % 4 == 0]
+    assert {1, 2} <= set(apart)
+    assert max(apart) <= 4
+
+
+def test_what_a_photograph_shows_many_times_counts_little_more_than_once(monkeypatch):
+    """A roof of 40 equal tiles among 40 other things: who shows those is more alike than who shows such a roof."""
+    rng = np.random.default_rng(0)
+    words = rng.uniform(60, 195, (41, 128)).astype(np.float32)
+    things, others = (words + rng.uniform(-9, 9, (2, 41, 128))).round().astype(np.uint8)
+    roof, garden, street = np.repeat(things[:1], 40, axis=0), things[1:].repeat(2, axis=0), others[1:].repeat(2, axis=0)
+    looks = [np.concatenate([roof, garden]), garden, np.concatenate([roof, street])]
+    monkeypatch.setattr(pair_selection, "NUM_RETRIEVED", 1)
+    monkeypatch.setattr(pair_selection, "_vocabulary", lambda *_: words)
+    assert pair_selection.retrieval_pairs(looks.__getitem__, 3, [0]) == {(0, 1)}

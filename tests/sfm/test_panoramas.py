@@ -52,6 +52,16 @@ def test_faces_look_where_they_say():
         assert np.array_equal(np.cross(axes[0], axes[1]), axes[2])
 
 
+def test_the_mirror_image_of_a_panorama_has_mirrored_faces():
+    """Exactly: no face is moved by part of a pixel."""
+    panorama = np.random.default_rng(0).uniform(0, 255, (60, 120)).astype(np.float32)
+    for name, other in {"front": "front", "back": "back", "left": "right", "up": "up"}.items():
+        mirrored = cut_face(panorama[:, ::-1], other, 20)
+        np.testing.assert_allclose(mirrored[:, ::-1], cut_face(panorama, name, 20), atol=0.5)
+    flipped = cut_face(panorama[::-1], "down", 20)
+    np.testing.assert_allclose(flipped[::-1], cut_face(panorama, "up", 20), atol=0.5)
+
+
 def write(folder, number: int, xmp: bytes = b'<rdf:Description GPano:ProjectionType="equirectangular"/>') -> None:
     folder.mkdir(exist_ok=True)
     pixels = np.random.default_rng(number).integers(0, 255, (120, 240, 3), np.uint8)

@@ -333,17 +333,17 @@ def test_the_height_over_the_median_point_is_compared_where_views_show_the_groun
 @pytest.mark.parametrize(
     ("lower", "others", "said"),
     [
-        pytest.param(12.0, 0.6, True, id="a wrong tag"),
-        pytest.param(0.3, 0.6, False, id="a lens that zooms"),
-        pytest.param(12.0, 1.0, False, id="one focal length"),
+        pytest.param(12.0, 0.6, "12.4 m lower", id="a wrong tag"),
+        pytest.param(-12.0, 0.6, "11.6 m higher", id="the other way"),
+        pytest.param(0.3, 0.6, "", id="a lens that zooms"),
+        pytest.param(12.0, 1.0, "", id="one focal length"),
     ],
 )
 def test_a_focal_length_of_few_that_moves_them_is_named(tmp_path, lower, others, said):
     seen = [photograph(tmp_path, k, focal_mm=8.5 * (others if k < 2 else 1)) for k in range(8)]
     off = {photo.name: -lower * (k < 2) + 0.1 * k for k, photo in enumerate(seen)}
-    assert ["the 2 photographs with a focal length of 82 px" in each for each in _lens_warnings(seen, off, 40.0)] == (
-        [True] if said else []
-    )
+    words = f"the 2 photographs with a focal length of 82 px come out {said} than their positions say"
+    assert [words in each for each in _lens_warnings(seen, off, 40.0)] == ([True] if said else [])
 
 
 def test_photographs_of_one_name_are_told_apart_by_moment_and_place(tmp_path):

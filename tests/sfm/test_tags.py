@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from support.flights import add_xmp, write_photograph
-from vdgs.captures.angles import degrees_of_text
+from vdgs.captures.angles import degrees_of_parts, degrees_of_text
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.cross_checks import cross_checked, strays
 from vdgs.sfm.exif_gps import read_altitude, read_altitudes, read_place
@@ -129,6 +129,7 @@ def test_xmp_fills_what_exif_lacks_and_its_contradiction_is_no_knowledge(attribu
         ({5: "1", 6: 120.0}, -120),
         ({5: 2, 6: 120.0}, 120),  # Exif 3: above the sea
         ({5: 3, 6: 120.0}, -120),
+        ({5: "3", 6: 120.0}, -120),
         ({6: R(0, 0)}, None),
         ({5: 0, 6: 1e9}, None),
     ],
@@ -149,6 +150,9 @@ def test_altitudes_and_their_references(gps, altitude):
         ("33 minutes", 33),
         ("33?30'0\" N", 33.5),  # a program without the sign of degrees
         ("33.5?", None),
+        ("33°60'0\"", 34.0),  # rounded seconds
+        ("33°75'0\"", None),
+        ("33°30'61\"", None),
         ("x", None),
         ("", None),
         ("50%", None),
@@ -158,6 +162,11 @@ def test_angles_are_read_from_text(text, degrees):
     assert degrees_of_text(f"{text}%", "latitude") is None
     read = degrees_of_text(text, "latitude")
     assert (read and read[0]) == (degrees if degrees is None else pytest.approx(degrees))
+
+
+def test_minutes_just_south_of_the_equator_keep_the_sign_of_their_degrees():
+    assert degrees_of_parts([-0.0, 30.0]) == -0.5
+    assert degrees_of_parts([-33.0, 30.0, 36.0]) == pytest.approx(-33.51)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.flight_cameras import make_camera, make_flight_cameras, make_test_cameras
+from vdgs.synth.flight_cameras import _pose, make_camera, make_flight_cameras, make_test_cameras
+from vdgs.synth.flight_plans import FLIGHT_PLANS, FlightArea, altitude_for_overlap
 from vdgs.synth.mesh import Material, MeshBuilder
 from vdgs.synth.perturbations import add_outliers, exposure_gains, perturb_cameras
 from vdgs.synth.ray_tracing import RayTracer
@@ -132,6 +133,34 @@ def test_overlap_sets_the_altitude(town: Town) -> None:
         make_flight_cameras(options_of("even", overlap=0.1), town)
 
 
+def test_overlap_is_that_of_an_even_grid() -> None:
+    """Pictures of a lens as long as they are wide, of 3 by 4: of the mean side so much is that of the next, too."""
+    altitude = altitude_for_overlap(900.0, 100, 0.7, 1.0)
+    assert 1 - (900.0 / 10) / (altitude * np.sqrt(0.75)) == pytest.approx(0.7)
+
+
+def test_orbits_look_at_the_feet_of_their_landmarks(town: Town) -> None:
+    landmarks = np.array([[10.0, -20.0], [-60.0, 35.0]])
+    area = FlightArea(half=100.0, altitude=50.0, count=24, phase=0.4, plan=town.plan, landmarks=landmarks)
+    orbits = FLIGHT_PLANS["orbits"](area)
+    reach = area.altitude * orbits.altitude_factor * np.tan(orbits.tilt)
+    ahead = np.stack([np.sin(orbits.heading), np.cos(orbits.heading)], axis=1)
+    np.testing.assert_allclose(orbits.position_xy + reach[:, None] * ahead, landmarks[np.arange(24) % 2], atol=1e-9)
+
+
+def test_test_views_look_at_what_they_are_to_show(town: Town) -> None:
+    """But for what is drawn: some metres of each, and the ground below."""
+    options, rng = options_of("even", width=64, height=48), np.random.default_rng(0)
+    training = make_flight_cameras(options, town)
+    missed = []
+    for x, y in ((0.0, 60.0), (60.0, 0.0), (-60.0, 0.0), (0.0, -60.0)) * 5:
+        target = np.array([x, y, float(town.terrain.height_without_ponds(x, y))])
+        camera = _pose(town.terrain, training[:3], target, options, rng)
+        reach = (target[2] - camera.position[2]) / camera.forward[2]
+        missed.append(np.linalg.norm((camera.position + reach * camera.forward - target)[:2]))
+    assert np.median(missed) < 20.0
+
+
 def test_what_stands_in_between_hides() -> None:
     """A wall above flat ground: places behind it are in the frustum and yet not seen."""
     builder = MeshBuilder()
@@ -216,6 +245,7 @@ def test_noise_has_the_size_that_was_asked_for(town: Town) -> None:
     gains = np.log2(exposure_gains(4000, 0.5, np.random.default_rng(0)))
     assert gains[:, 1].std() == pytest.approx(0.5, rel=0.2)
     assert np.abs(np.diff(gains[:, 1])).mean() < 0.6 * gains[:, 1].std(), "exposure drifts, it does not flicker"
+    np.testing.assert_allclose(gains[:, [0, 2]].mean(axis=1), gains[:, 1], atol=1e-9)  # warmth changes no brightness
     assert (exposure_gains(5, 0.0, np.random.default_rng(0)) == 1).all()
 
 

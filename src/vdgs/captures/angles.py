@@ -38,7 +38,7 @@ def degrees_of_parts(parts: Sequence[float | None]) -> float | None:
         return None
     if len(parts) > 1 and parts[1] is None and parts[0] % 1 == 0:
         return None
-    whole, *rest = (value or 0.0 for value in parts)
+    whole, *rest = (0.0 if value is None else value for value in parts)
     if any(not 0 <= value < 60.0001 for value in rest):
         return None
     degrees = sum(value / 60**power for power, value in enumerate((abs(whole), *rest)))

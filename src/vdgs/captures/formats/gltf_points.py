@@ -102,10 +102,9 @@ def _colors(content: JsonObject, number: int | None, count: int, file: Path) -> 
     if number is None:
         return np.full((count, 3), GRAY, np.uint8)
     colors = _accessor(content, number, file)[:, :3]
-    if colors.dtype == np.uint8:
-        return colors.copy()
     most = 1.0 if colors.dtype.kind == "f" else float(np.iinfo(colors.dtype).max)
-    return np.nan_to_num(255 * colors / most).clip(0, 255).astype(np.uint8)
+    levels = colors.astype(np.float64) * (255 / most)
+    return np.nan_to_num(levels, nan=GRAY).round().clip(0, 255).astype(np.uint8)
 
 
 def _accessor(content: JsonObject, number: int, file: Path) -> np.ndarray:

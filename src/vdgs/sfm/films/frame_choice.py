@@ -115,6 +115,8 @@ class FrameChooser(Generic[Frame]):
         if mark != self._mark:
             self._close()
             self._mark = mark = round(travel / self._step)  # the step may have grown
+        if self._kept and mark == self._kept[-1][0]:  # and with it the reach of a mark whose frame is taken
+            return
         beside = min(1.0, 2 * abs(travel / self._step - mark))
         score = sharp * (1 - (1 - EDGE_WEIGHT) * beside**2)
         if self._best is None or score > self._best[0]:
