@@ -41,11 +41,11 @@ CODECS = {"ffmpeg": "H.264", "av": "H.264", "vp9": "VP9", "mpeg4": "MPEG-4"}
 CRF = "20"
 #: Code of BT.709 in a stream, for its matrix, primaries and transfer alike, and of the limited range (ITU-T H.273).
 _BT709, _LIMITED_RANGE = 1, 1
-#: The same in the words of ffmpeg.
+#: The same in the words of ffmpeg: frames converted, then marked, which marks the stream.
 _FFMPEG_COLORS = (
-    "-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709", "-color_primaries", "bt709",
-    "-color_trc", "bt709", "-color_range", "tv",
-)  # fmt: skip
+    "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv"
+)
 _FOURCC = {"vp9": "vp09", "mpeg4": "mp4v"}
 _REMEDY = "Install an encoder with `pip install imageio-ffmpeg`, or render single images instead."
 
@@ -119,8 +119,8 @@ class _Ffmpeg(_Pen):
         self._process = subprocess.Popen(
             [
                 _ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-                "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:.6g}", "-i", "-", "-an", *_FFMPEG_COLORS, "-c:v", "libx264",
-                "-crf", CRF, "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file),
+                "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:.6g}", "-i", "-", "-an", "-vf", _FFMPEG_COLORS, "-c:v",
+                "libx264", "-crf", CRF, "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file),
             ],
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said,
         )  # fmt: skip
