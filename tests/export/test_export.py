@@ -94,6 +94,15 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_the_run_notes_files_within_it_as_they_lie_in_it(export, tmp_path: Path):
+    """A run is moved and copied as one."""
+    record = export("run/views/a.splat", "b.splat", sh_degree=0)
+    noted = read_json(tmp_path / "run" / RECORD_FILE)
+    paths = [str(tmp_path / name) for name in ("run/views/a.splat", "b.splat")]
+    assert [file["file"] for file in record["files"]] == paths
+    assert [file["file"] for file in noted["files"]] == ["views/a.splat", paths[1]]
+
+
 def test_a_run_that_may_only_be_read_is_exported(export, tmp_path: Path):
     (tmp_path / "run" / RECORD_FILE).mkdir(parents=True)  # stands for a folder that cannot be written, which root can
     assert export("a.splat", sh_degree=0)["gaussians"]

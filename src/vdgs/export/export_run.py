@@ -141,16 +141,33 @@ def resolve_request(request: ExportRequest) -> ExportRequest:
 def export_run(
     run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
 ) -> ExportDocument:
-    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json."""
+    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json: there, files
+    in the run folder by their paths from it, as it may be moved or copied."""
     if execution is None or not execution.is_distributed:
         forget_shards(run)
     record = write_files(run, request, console, execution)
     try:
-        write_json(run.folder.path / RECORD_FILE, record)
+        write_json(run.folder.path / RECORD_FILE, _as_noted(record, run.folder.path.resolve()))
     except VdgsError:  # a run that may only be read
         file = escape(str(run.folder.path / RECORD_FILE))
         console.print(f"[yellow]note[/] {file} cannot be written: the report will not know of these files")
     return record
+
+
+def _as_noted(record: ExportDocument, folder: Path) -> ExportDocument:
+    """The record of a run in `folder`, its files there by their paths from it."""
+
+    def shortened(file: str) -> str:
+        path = Path(file)
+        return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else file
+
+    noted = record.copy()
+    noted["files"] = [{**each, "file": shortened(each["file"])} for each in record["files"]]
+    noted["losses"] = [
+        {**each, "file": shortened(file) if isinstance(file := each["file"], str) else None}
+        for each in record["losses"]
+    ]
+    return noted
 
 
 def write_files(
