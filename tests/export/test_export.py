@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import sys
 from dataclasses import replace
@@ -91,6 +92,15 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     assert read_json(tmp_path / "run" / RECORD_FILE) == record
     assert [Path(file["file"]).name for file in record["files"]] == ["a.ply", "b.splat", "c.ply", "d.points.ply"]
     assert not list(tmp_path.glob(".*"))
+
+
+def test_the_run_notes_files_within_it_as_they_lie_in_it(export, tmp_path: Path):
+    """A run is moved and copied as one."""
+    record = export("run/views/a.splat", "b.splat", sh_degree=0)
+    noted = read_json(tmp_path / "run" / RECORD_FILE)
+    paths = [str(tmp_path / name) for name in ("run/views/a.splat", "b.splat")]
+    assert [file["file"] for file in record["files"]] == paths
+    assert [file["file"] for file in noted["files"]] == ["views/a.splat", paths[1]]
 
 
 def test_a_run_that_may_only_be_read_is_exported(export, tmp_path: Path):
@@ -292,14 +302,51 @@ def test_fewer_gaussians_are_merged_and_moved_not_dropped(export, tmp_path: Path
         (("a.ply",), {"crs": "EPSG:32632"}, "not georeferenced"),
     ],
 )
-def test_what_cannot_be_written_is_said_before_anything_is_baked(
+def test_what_cannot_be_written_is_said_before_any_view_is_drawn(
     export, tmp_path: Path, monkeypatch, names, asked, said
 ):
-    monkeypatch.setattr(local_bake, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(local_bake, "collect_contributions", lambda *_: pytest.fail("drawn"))
     monkeypatch.setattr(html, "_frame_bytes", lambda: 6_000_000)
     with pytest.raises(VdgsError, match=said):
         export(*names, **asked)
     assert not list(tmp_path.glob("*.ply"))
+
+
+@pytest.mark.parametrize(
+    ("name", "package"), [("a.laz", "laspy"), ("a.laz", "lazrs"), ("a.spz", "zstandard"), ("a.html", "viser")]
+)
+def test_a_package_that_a_file_needs_is_asked_for_before_any_view_is_drawn(
+    export, tmp_path: Path, monkeypatch, name, package
+):
+    monkeypatch.setattr(local_bake, "collect_contributions", lambda *_: pytest.fail("drawn"))
+    monkeypatch.setitem(sys.modules, package, None)  # not to be imported
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else there(name))
+    with pytest.raises(VdgsError, match=rf"{name}: .*needs? .*{package}"):
+        export(name, spz_version=4)
+
+
+@pytest.mark.parametrize(("name", "taken"), [("tileset.json", "tileset.json"), ("scene.json", "index.html")])
+def test_a_place_that_is_taken_is_named_before_any_view_is_drawn(export, tmp_path: Path, monkeypatch, name, taken):
+    monkeypatch.setattr(local_bake, "collect_contributions", lambda *_: pytest.fail("drawn"))
+    if taken == name:
+        (tmp_path / taken).mkdir()
+    else:
+        (tmp_path / taken).write_text("<p>of somebody")
+    with pytest.raises(VdgsError, match=taken):
+        export(name)
+
+
+def test_a_box_is_refused_by_what_lies_where(export):
+    """A block in the west and one in the east; a box in which the model has something that no photograph shows."""
+    parted = scattered((80, 120))
+    apart = moved(parted, torch.where(torch.arange(200) < 80, -10.0, 10.0))
+    with pytest.raises(VdgsError, match=r"nothing of block 0, which lies within -1\d\.\d .* of --crs local\."):
+        export("a.ply", model=apart, block=0, bbox=(7.0, -3.0, 13.0, 3.0))
+    high = replace(parted.anchors, positions=parted.anchors.positions + torch.tensor([0, 0, 500.0]))
+    for asked in ({}, {"bbox": (-1.0, -1.0, 1.0, 1.0)}, {"block": 1}):
+        with pytest.raises(VdgsError, match="no training camera draws anything of what was asked for"):
+            export("a.ply", model=replace(parted, anchors=high), **asked)
 
 
 def test_a_background_is_an_output_like_the_others(export, tmp_path: Path, monkeypatch):

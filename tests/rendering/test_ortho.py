@@ -22,11 +22,12 @@ from support.mapped_house import (
     surface,
     surveyor_of,
 )  # fmt: skip
+from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import render
-from vdgs.rendering.ortho import ortho_plan, previews
+from vdgs.rendering.ortho import ortho_plan, previews, tile_renderer
 from vdgs.rendering.ortho.geotiff import GDAL_CACHE_BYTES, limit_gdal_cache
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import TILE_PX, PixelGrid, capture_extent, grid_from_bbox, ground_sampling_distance
@@ -38,6 +39,7 @@ from vdgs.rendering.ortho.tile_renderer import (
     TileRenderer,
     samples_per_side,
 )
+from vdgs.visibility.visibility_counts import count_visibility
 
 rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
@@ -307,6 +309,53 @@ def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
         PixelGrid(-3.0, 0.0, 0.25, 12, 12)
     )
     assert low.heights[low.alpha > 0].max() < 1.0
+
+
+def test_the_ceiling_over_a_place_is_that_of_the_points_about_it_whatever_their_order():
+    random = np.random.default_rng(3)
+    places = random.uniform(-8, 8, (4000, 3)) * (1, 1, 4)
+    capture = capture_of(places)
+    clip = NadirCamera.of(capture, MapProjection.of(capture.ground, "local")).clip_height
+    for point, radius in zip(random.uniform(-10, 10, (40, 3)), random.uniform(0.1, 5, 40), strict=True):
+        about = np.sort(places[(np.abs(places[:, :2] - point[:2]) <= radius).all(axis=1), 2])
+        expected = 20.0
+        if len(about):
+            top, low = np.quantile(about, 0.995), np.median(about)
+            expected = max(20.0, top + 0.1 * (top - low))
+        assert clip.height_above(point, radius) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_tile_asks_only_the_cameras_and_points_about_it(house, monkeypatch):
+    """Of a large flight, a tile is drawn and counted as of its part."""
+    capture, model = house
+    placement, grid = MapProjection.of(capture.ground, "local"), PixelGrid(-3.0, 1.0, 0.1, 40, 40)
+    alone = surveyor_of(model, capture, placement).render_tile(grid)
+    away = [replace(capture.views[0], camera=_above(500.0 + 9 * k, 0.0, 20.0)) for k in range(50)]
+    many = surveyor_of(model, replace(capture, views=(*capture.views, *away)), placement)
+    asked = []
+
+    def counting(positions, cameras):
+        asked.append(len(cameras))
+        return count_visibility(positions, cameras)
+
+    monkeypatch.setattr(tile_renderer, "count_visibility", counting)
+    tile = many.render_tile(grid)
+    assert asked == [len(capture.views)]
+    for name in ("colors", "alpha", "heights", "visibility"):
+        np.testing.assert_array_equal(getattr(tile, name), getattr(alone, name))
+
+
+@pytest.mark.parametrize("kept", [0, 3])
+def test_box_and_pixel_size_make_a_map_where_the_sparse_points_say_nothing(house, make, kept):
+    capture, model = house
+    points = np.array([(0.5 * k, 0.0, 0.0) for k in range(kept)]).reshape(-1, 3)
+    bare = replace(capture, points=points, point_colors=capture.point_colors[:kept])
+    with pytest.raises(VdgsError, match="Give --bbox" if kept else "Give --gsd"):
+        make(bare, model)
+    given = {"crs": "local", "bbox": (-4.0, -4.0, 4.0, 4.0), "gsd": 0.2}
+    with rasterio.open(make(bare, model, **given) / "dsm.tif") as file:
+        assert file.shape == (40, 40)
+        assert file.read(1).max() == pytest.approx(ROOF, abs=0.05)
 
 
 def _above(x: float, y: float, z: float) -> Camera:

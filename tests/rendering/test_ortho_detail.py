@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from support.captures import look_down
 from support.mapped_house import GROUND, TOP, capture_of, model_of, surveyor_of
 from vdgs.captures.capture import Capture
 from vdgs.geometry.map_projection import MapProjection
@@ -67,6 +68,23 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     detail = pattern(np.stack(np.meshgrid(x, y), axis=-1))
     assert np.corrcoef(gained[ground], detail[ground])[0, 1] > 0.7
     assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()
+
+
+def test_photographs_far_away_change_no_detail(house, tmp_path, monkeypatch):
+    capture, model = house
+    capture = photographed(capture, model, tmp_path, 0.06)
+    away = look_down(np.array([900.0, 0.0, 20.0]))
+    far = tuple(replace(view, camera=replace(view.camera, camera_from_world=away)) for view in capture.views)
+    grid, placement = PixelGrid(-3.0, 5.0, 0.16, 60, 50), MapProjection.of(capture.ground, "local")
+    asked, trust = [], detail_transfer._trust
+    monkeypatch.setattr(detail_transfer, "_trust", lambda camera, at: asked.append(camera) or trust(camera, at))
+    colors = []
+    for views in (capture.views, (*far, *capture.views)):
+        sharpener = DetailTransfer(model, replace(capture, views=views))
+        colors.append(surveyor_of(model, capture, placement, detail_transfer=sharpener).render_tile(grid).colors)
+        sharpener.close()
+    np.testing.assert_array_equal(*colors)
+    assert not any(camera.position[0] > 100 for camera in asked)
 
 
 def gray(places: np.ndarray) -> AnchorModel:

@@ -163,6 +163,14 @@ def test_a_file_with_everything(tmp_path: Path):
     assert len(smooth.cameras) == 20
 
 
+def test_films_of_another_shape_than_the_photographs_are_not_stretched(tmp_path: Path):
+    file = write(tmp_path, [VIEW | {"width": 400, "height": 360}, VIEW | {"position": [0, 5, 1]}])
+    for camera in load_path(file, TEMPLATE, seconds=1.0).cameras:
+        assert (camera.width, camera.height) == (400, 360)
+        found = camera.fx, camera.fy, camera.cx, camera.cy
+        assert found == pytest.approx((800.0, 820.0, 200.0, 180.0))  # twice as high as the template, and as the view is
+
+
 def test_a_path_in_the_source_frame_shows_the_same(tmp_path: Path):
     rotation = Rotation.from_euler("xyz", [1.2, 0.3, -0.4]).as_matrix()
     ground = GroundFrame(

@@ -110,6 +110,26 @@ def test_every_encoder_writes_a_whole_film(tmp_path: Path, encoder: Encoder):
     assert (caution(encoder) is None) == (encoder in ("ffmpeg", "av"))
 
 
+@pytest.mark.parametrize("encoder", ["ffmpeg", "av"])
+@pytest.mark.parametrize("size", [(48, 64), (720, 1280)])
+def test_h264_has_its_colors_by_bt709_and_says_so(tmp_path: Path, encoder: Encoder, size: tuple[int, int]):
+    """Players take a large film that says nothing to be of BT.709, and a small one of BT.601."""
+    av = pytest.importorskip("av")
+    if encoder == "ffmpeg" and not ffmpeg_is_there():
+        pytest.skip("there is no ffmpeg here")
+    file, grass = tmp_path / "film.mp4", (60, 140, 40)
+    with VideoWriter(file, 25.0, encoder=encoder) as film:
+        for _ in range(3):
+            film.write(np.full((*size, 3), grass, np.uint8))
+    with av.open(str(file)) as container:
+        frame = next(container.decode(video=0))
+        said = container.streams.video[0].codec_context
+        tags = [said.colorspace, said.color_primaries, said.color_trc, said.color_range]
+    assert [int(tag) for tag in tags] == [1, 1, 1, 1]  # BT.709, limited range
+    decoded = frame.reformat(format="rgb24", src_colorspace="ITU709", src_color_range="MPEG").to_ndarray()
+    np.testing.assert_allclose(decoded[20, 20], grass, atol=3)
+
+
 def ffmpeg_is_there() -> bool:
     return bool(importlib.util.find_spec("imageio_ffmpeg")) or video._ffmpeg_on_path() is not None
 

@@ -218,6 +218,14 @@ def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
     for other in ({**record, "key": "another"}, {**record, "files": []}, {"files": 3}):
         write(run.path / "export.json", other)
         assert "Move through" not in write_report(run).read_text()
+    # A page in the run is there wherever the run is moved.
+    page.rename(run.path / "scene.html")
+    write(run.path / "export.json", {**record, "files": [{"file": "scene.html", "bytes": 7_100_000}]})
+    run.path.rename(tmp_path / "moved")
+    moved = RunFolder(tmp_path / "moved")
+    assert '<a href="scene.html">Move through the scene</a>' in write_report(moved).read_text()
+    moved.path.rename(run.path)
+    (run.path / "scene.html").rename(page)
     write(run.path / "export.json", record)
     page.unlink()
     assert "Move through" not in write_report(run).read_text()

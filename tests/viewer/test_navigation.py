@@ -57,6 +57,18 @@ def test_all_of_a_photograph_fits_the_canvas():
         assert focal * 120 / 100 <= 1 + 1e-9
 
 
+def test_a_window_that_changes_its_shape_between_key_frames_stretches_no_film(tmp_path):
+    at, level = np.zeros(3), np.array([1.0, 0, 0, 0])
+    frames = [navigation.camera_from_browser(level, at, 1.0, *size) for size in ((1600, 900), (900, 1201), (320, 200))]
+    file = tmp_path / "path.json"
+    file.write_text(path_json(frames, 4.0, fps=10.0))
+    for camera in (*load_path(file, camera_at(0, 0)).cameras, *video_cameras(frames, 4.0)):
+        assert (camera.width, camera.height) == (1600, 900)
+        assert (camera.cx, camera.cy) == pytest.approx((800, 450))
+        assert camera.fx == pytest.approx(camera.fy)
+        assert 2 * math.atan(450 / camera.fy) == pytest.approx(1.0)  # as high as the viewer showed it
+
+
 def test_a_path_is_read_back_as_it_was_set(tmp_path):
     frames = [camera_at(x, 1.0, 5.0, 10.0 * x, 7.0 * x, 640) for x in (0.0, 1.3, 2.9)]
     file = tmp_path / "path.json"

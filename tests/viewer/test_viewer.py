@@ -284,6 +284,19 @@ def test_the_nearest_photograph_is_that_of_the_place_and_direction(scene):
         assert nearest_view_index(scene, view.camera) == index
 
 
+def test_errors_and_moves_look_through_no_sparse_points_again(scene, monkeypatch):
+    """Of a large capture that takes longer than a preview, for each part of each picture."""
+    fresh, camera, asked = ViewerScene(scene.run), camera_at(0.3, -0.5), []
+    real = viewer_scene.camera_height
+    monkeypatch.setattr(viewer_scene, "camera_height", lambda capture: asked.append(capture) or real(capture))
+    painter, display = Painter(fresh), DisplayOptions("error")
+    for first, last in ((0, 20), (20, 48)):
+        painter.paint(display, camera.cropped(0, first, camera.width, last), camera)
+    assert [nearest_view_index(fresh, view.camera) for view in scene.capture.views] == list(range(9))
+    assert asked == [scene.capture]
+    fresh.close()
+
+
 def test_the_newest_photograph_file_is_not_needed_to_look(scene, tmp_path: Path):
     """A photograph that is gone is one layer's trouble."""
     views = tuple(replace(view, image_path=tmp_path / "gone.png") for view in scene.capture.views)

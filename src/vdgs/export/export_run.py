@@ -33,6 +33,8 @@ from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialVie
 from vdgs.export.formats.gaussian_store import GaussianStore
 from vdgs.export.gaussian_optimization import optimize_gaussians
 from vdgs.export.gaussian_selection import (
+    asked_gaussians,
+    check_files,
     frame_for_file,
     local_bounds,
     rows_within_reach,
@@ -139,16 +141,33 @@ def resolve_request(request: ExportRequest) -> ExportRequest:
 def export_run(
     run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
 ) -> ExportDocument:
-    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json."""
+    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json: there, files
+    in the run folder by their paths from it, as it may be moved or copied."""
     if execution is None or not execution.is_distributed:
         forget_shards(run)
     record = write_files(run, request, console, execution)
     try:
-        write_json(run.folder.path / RECORD_FILE, record)
+        write_json(run.folder.path / RECORD_FILE, _as_noted(record, run.folder.path.resolve()))
     except VdgsError:  # a run that may only be read
         file = escape(str(run.folder.path / RECORD_FILE))
         console.print(f"[yellow]note[/] {file} cannot be written: the report will not know of these files")
     return record
+
+
+def _as_noted(record: ExportDocument, folder: Path) -> ExportDocument:
+    """The record of a run in `folder`, its files there by their paths from it."""
+
+    def shortened(file: str) -> str:
+        path = Path(file)
+        return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else file
+
+    noted = record.copy()
+    noted["files"] = [{**each, "file": shortened(each["file"])} for each in record["files"]]
+    noted["losses"] = [
+        {**each, "file": shortened(file) if isinstance(file := each["file"], str) else None}
+        for each in record["losses"]
+    ]
+    return noted
 
 
 def write_files(
@@ -157,8 +176,9 @@ def write_files(
     """Write the files of a resolved request from an opened run, or a scene in memory; returns what was done.
 
     The scene is baked in this process, or in shards where `execution` sends them: the files are the same. Raises
-    VdgsError, before any Gaussian is baked, for outputs among a capture's inputs, an empty choice, and coordinates
-    that a format or the capture does not have; and what `ShardedJob.send` raises.
+    VdgsError, before any view is drawn, for outputs among a capture's inputs, a block or box without anything, and a
+    system, packages or folders that a file needs and has not; before any Gaussian is baked, for a choice of which no
+    view shows anything, and coordinates that a format does not have; and what `ShardedJob.send` raises.
     """
     print_warning(console, run.warning)
     for path in _all_outputs(request):
@@ -171,11 +191,14 @@ def write_files(
         check_takes_files(path.parent)
     _tidy(request.output, console)
     began = time.monotonic()
-    whole, run = run, with_faded_edge(run, request)
     page = make_initial_view(run, int(request.html_max_mb * 1e6))
+    check_files(frames, request, page)
+    asked = asked_gaussians(run, request)
+    whole, run = run, with_faded_edge(run, request)
     with _make_baker(run, request, execution, console) as baker, ExitStack() as stack:
         pixels = baker.pixels()
-        kept = select_gaussians(pixels, run, request)
+        kept = select_gaussians(pixels, asked, run)
+        del asked
         means = gaussian_means(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
         rows = select_rows(frames, means, pixels[kept], request, page, console)
         console.print(

@@ -35,31 +35,52 @@ def with_faded_edge(run: OpenedRun, request: ExportRequest) -> OpenedRun:
     return replace(run, model=with_fade(run.model, cameras, request.min_visibility))
 
 
-def select_gaussians(pixels: Float[np.ndarray, " g"], run: OpenedRun, request: ExportRequest) -> Int[np.ndarray, " m"]:
-    """The Gaussians to write, ascending: drawn by a training camera, of the block, within the box. `pixels`: how many
-    each makes. Raises VdgsError where none is left."""
+def check_files(frames: Mapping[Path, LocalFrame], request: ExportRequest, page: InitialView) -> None:
+    """Raise VdgsError for what no file of a format can hold, or be, whichever Gaussians it is given."""
+    for path, frame in frames.items():
+        registry.check_export(path, _unwritten(frame, 1, request, page))
+
+
+def asked_gaussians(run: OpenedRun, request: ExportRequest) -> Bool[np.ndarray, " g"]:
+    """Whether each Gaussian of the model is of the block and within the box that are asked for. Raises VdgsError where
+    there is no such block, or nothing of the model in the box."""
     k = run.model.anchors.offsets.shape[1]
-    wanted = pixels > 0
+    asked = np.ones(len(run.model.anchors.positions) * k, bool)
     if request.block is not None:
-        wanted &= np.repeat(_anchors_of_block(run, request.block), k)
+        asked = np.repeat(_anchors_of_block(run, request.block), k)
     if request.bbox is not None:
-        x0, y0, x1, y1 = request.bbox
-        if not (x0 < x1 and y0 < y1):
-            raise VdgsError(
-                f"--bbox {x0:.12g} {y0:.12g} {x1:.12g} {y1:.12g}: is empty. Give X0 Y0 X1 Y1, the lower corner first."
-            )
-        crs = request.crs or default_crs(run.capture.ground, request.output[0])
-        inside = MapProjection.of(run.capture.ground, crs).project(
-            gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
+        asked &= _is_in_box(run, request, request.bbox, asked)
+    return asked
+
+
+def _is_in_box(
+    run: OpenedRun, request: ExportRequest, bbox: tuple[float, float, float, float], among: Bool[np.ndarray, " g"]
+) -> Bool[np.ndarray, " g"]:
+    """Whether each Gaussian is in a box. Raises VdgsError where the box has no inside, or holds none of some."""
+    x0, y0, x1, y1 = bbox
+    box = f"--bbox {x0:.12g} {y0:.12g} {x1:.12g} {y1:.12g}"
+    if not (x0 < x1 and y0 < y1):
+        raise VdgsError(f"{box}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
+    placement = MapProjection.of(run.capture.ground, request.crs or default_crs(run.capture.ground, request.output[0]))
+    means = gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
+    places = placement.project(means)[:, :2]
+    inside: np.ndarray = ((places >= (x0, y0)) & (places <= (x1, y1))).all(1)
+    if among.any() and not (inside & among).any():
+        low, high = places[among].min(0), places[among].max(0)
+        what = "the scene" if request.block is None else f"block {request.block}"
+        raise VdgsError(
+            f"{box}: holds nothing of {what}, which lies within "
+            f"{low[0]:.1f} {low[1]:.1f} {high[0]:.1f} {high[1]:.1f} of --crs {placement.crs}."
         )
-        wanted &= (inside[:, :2] >= (x0, y0)).all(1) & (inside[:, :2] <= (x1, y1)).all(1)
-        if not wanted.any():
-            low, high = inside[pixels > 0, :2].min(0), inside[pixels > 0, :2].max(0)
-            raise VdgsError(
-                f"--bbox {x0:.12g} {y0:.12g} {x1:.12g} {y1:.12g}: holds nothing of the scene, which lies within "
-                f"{low[0]:.1f} {low[1]:.1f} {high[0]:.1f} {high[1]:.1f} of --crs {crs or 'UTM'}."
-            )
-    kept = np.flatnonzero(wanted)
+    return inside
+
+
+def select_gaussians(
+    pixels: Float[np.ndarray, " g"], asked: Bool[np.ndarray, " g"], run: OpenedRun
+) -> Int[np.ndarray, " m"]:
+    """The Gaussians to write, ascending: asked for, and drawn by a training camera. `pixels`: how many each makes.
+    Raises VdgsError where none is left."""
+    kept = np.flatnonzero(asked & (pixels > 0))
     if not len(kept):
         raise VdgsError(f"{run.model_path}: no training camera draws anything of what was asked for.")
     return kept
@@ -111,19 +132,18 @@ def select_rows(
                 highlight=False,
             )
         rows[path] = np.flatnonzero(~beyond)
-        registry.check_export(
-            path,
-            ExportScene(
-                chunks=(),
-                count=min(len(rows[path]), request.max_gaussians or len(rows[path])),
-                degree=request.sh_degree,
-                metadata=frame.facts,
-                bounds=local_bounds(frame, means[rows[path]]),
-                page=page,
-                spz_version=request.spz_version,
-            ),
-        )
+        count = min(len(rows[path]), request.max_gaussians or len(rows[path]))
+        scene = _unwritten(frame, count, request, page)
+        registry.check_export(path, replace(scene, bounds=local_bounds(frame, means[rows[path]])))
     return rows
+
+
+def _unwritten(frame: LocalFrame, count: int, request: ExportRequest, page: InitialView) -> ExportScene:
+    """What is known of the scene of a file before anything is baked."""
+    return ExportScene(
+        chunks=(), count=count, degree=request.sh_degree, metadata=frame.facts, page=page,
+        spz_version=request.spz_version,
+    )  # fmt: skip
 
 
 def rows_within_reach(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, " r"]:

@@ -95,6 +95,13 @@ class Camera:
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
+    def reshaped(self, width: int, height: int) -> Camera:
+        """The same view, as high as before, on an image of another size and shape: pixels keep their shape, and the
+        picture ends earlier or later at its sides. Raises ValueError for a part of a picture."""
+        scale = height / self.height
+        middle = width / 2 + scale * (self.cx - self.width / 2)
+        return replace(self.resized(width, height), fx=self.fx * scale, cx=middle)
+
     def limit_size(self, max_side_px: int) -> Camera:
         """The same view at most so many pixels wide and high; never enlarged."""
         scale = min(1.0, max_side_px / max(self.width, self.height))

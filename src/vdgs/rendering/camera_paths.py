@@ -43,7 +43,8 @@ def interpolate(keyframes: Sequence[Camera], n_frames: int, closed: bool = False
 
     The knots are spaced by the distance between key frames, so that the speed is even, and half evenly,
     so that turning on the spot takes time too (choice). The ends are met exactly; a closed path leaves
-    out the frame that would repeat the first. Intrinsics are interpolated linearly, the size is the first's.
+    out the frame that would repeat the first. Intrinsics are interpolated linearly, the size is the first's
+    (`Camera.reshaped`).
     """
     from scipy.interpolate import CubicHermiteSpline  # slow to load, and most who look at a scene make no path
     from scipy.spatial.transform import Rotation, Slerp
@@ -60,8 +61,8 @@ def interpolate(keyframes: Sequence[Camera], n_frames: int, closed: bool = False
     rotations = Rotation.from_matrix(np.stack([camera.camera_from_world[:3, :3] for camera in frames]))
     turned = Slerp(knots, rotations)(times).as_matrix()
     first = frames[0]
-    resized = [camera.resized(first.width, first.height) for camera in frames]
-    intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in resized])
+    reshaped = [camera.reshaped(first.width, first.height) for camera in frames]
+    intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in reshaped])
     values = np.stack([np.interp(times, knots, column) for column in intrinsics.T], axis=1)
     return [
         replace(first, camera_from_world=pose_from_rotation(rotation, position), fx=fx, fy=fy, cx=cx, cy=cy)

@@ -148,7 +148,7 @@ def _common_size(frames: Sequence[Any], default: Camera) -> Camera:
             width, height = (_number(entry, name, _SIDE) for name in _SIZE)
         except ValueError as error:
             raise ValueError(f"key frame {number}: {error}") from error
-        asked = default.resized(int(width or default.width), int(height or default.height))
+        asked = default.reshaped(int(width or default.width), int(height or default.height))
         if first is None:
             first = number, asked
         elif (asked.width, asked.height) != (first[1].width, first[1].height):
@@ -212,7 +212,7 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[
             _check_keys(entry, _NERFSTUDIO_FRAME_KEYS)
             _refuse_other_times(entry)
             world_from_camera = _matrix(entry["camera_to_world"], "camera_to_world") @ np.diag([1.0, -1.0, -1.0, 1.0])
-            camera = replace(default.resized(*size), camera_from_world=np.linalg.inv(world_from_camera))
+            camera = replace(default.reshaped(*size), camera_from_world=np.linalg.inv(world_from_camera))
             cameras.append(_with_fov(camera, _number(entry, "fov", _FOV_DEG) or 50.0))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"frame {number} of camera_path: {error}") from error

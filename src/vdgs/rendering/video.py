@@ -3,6 +3,9 @@
 H.264 (yuv420p) through the first of imageio-ffmpeg, PyAV and an `ffmpeg` with libx264 on the PATH; else VP9 through
 OpenCV, which Chromium, Firefox and Safari from 17 play, but not QuickTime nor the player of Windows; where OpenCV has
 no VP9 either, MPEG-4, which no browser plays. A finished film is looked at before it takes the place of another.
+
+H.264 is encoded by BT.709 in the limited range and says so: players read films that say nothing by their size, and not
+all alike. OpenCV can neither choose nor say the matrix (BT.601).
 """
 
 from __future__ import annotations
@@ -36,6 +39,13 @@ Encoder = Literal["ffmpeg", "av", "vp9", "mpeg4"]
 CODECS = {"ffmpeg": "H.264", "av": "H.264", "vp9": "VP9", "mpeg4": "MPEG-4"}
 #: Quality of H.264: 18 is hardly told from the original, 23 is ffmpeg's own.
 CRF = "20"
+#: Code of BT.709 in a stream, for its matrix, primaries and transfer alike, and of the limited range (ITU-T H.273).
+_BT709, _LIMITED_RANGE = 1, 1
+#: The same in the words of ffmpeg: frames converted, then marked, which marks the stream.
+_FFMPEG_COLORS = (
+    "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv"
+)
 _FOURCC = {"vp9": "vp09", "mpeg4": "mp4v"}
 _REMEDY = "Install an encoder with `pip install imageio-ffmpeg`, or render single images instead."
 
@@ -109,8 +119,8 @@ class _Ffmpeg(_Pen):
         self._process = subprocess.Popen(
             [
                 _ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-                "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:.6g}", "-i", "-", "-an", "-c:v", "libx264", "-crf", CRF,
-                "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file),
+                "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:.6g}", "-i", "-", "-an", "-vf", _FFMPEG_COLORS, "-c:v",
+                "libx264", "-crf", CRF, "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file),
             ],
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._said,
         )  # fmt: skip
@@ -170,9 +180,13 @@ class _Av(_Pen):
             raise OSError(str(error)) from error
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt, self._stream.options = "yuv420p", {"crf": CRF}
+        context = self._stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = _BT709
+        context.color_range = _LIMITED_RANGE
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
-        self._encode(self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24"))
+        picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+        self._encode(picture.reformat(format="yuv420p", dst_colorspace=_BT709, dst_color_range=_LIMITED_RANGE))
 
     def close(self) -> None:
         try:

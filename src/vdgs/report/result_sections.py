@@ -279,7 +279,7 @@ def seams_section(report: ReportedRun) -> Html:
     head = ["block", "pixels", "PSNR coarse", "PSNR isolated", "PSNR merged", "merged − coarse"]
     caption = (
         "PSNR pooled over the pixels of test views that show a block (not a mean over views). "
-        "Alone: the block as trained, before the merge"
+        "Isolated: the block as trained, before the merge"
     )
     absent = "There are no figures by block: fewer than two blocks are merged." if is_absent else ""
     parts = [

@@ -34,11 +34,11 @@ def html_export_link(report: ReportedRun) -> Html:
     if record.text("key") is None or record.text("key") != stage.key():
         return Html("")
     for file in record.rows("files"):
-        path = file.text("file") or ""
-        if path.lower().endswith(".html") and os.path.isfile(path):
-            address = quote(Path(os.path.relpath(path, run.path.resolve())).as_posix())
+        page = run.path.resolve() / (file.text("file") or "")  # of the run, or an absolute path
+        if page.suffix.lower() == ".html" and page.is_file():
+            address = quote(Path(os.path.relpath(page, run.path.resolve())).as_posix())
             size = (file.number("bytes") or 0) / 1e6
-            note = f" ({os.path.basename(path)}, {size:,.1f} MB; opens offline)"
+            note = f" ({page.name}, {size:,.1f} MB; opens offline)"
             return link(address, "Move through the scene", note)
     return Html("")
 

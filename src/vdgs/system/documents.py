@@ -116,6 +116,7 @@ class RunStatusDocument(TypedDict):
 class ExportedFile(TypedDict):
     """A file in export.json."""
 
+    #: From the run's folder where it lies in it, else absolute.
     file: str
     gaussians: int
     bytes: int

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.captures.first_view import FOV_DEG
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
@@ -57,7 +56,7 @@ class ClientSession:
         self._build()
         client.camera.on_update(lambda _: self._on_camera_moved())
         client.scene.on_click()(lambda event: self.point_panel.on_click(event.screen_pos))
-        height = camera_height(scene.capture)
+        height = scene.camera_height
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
         self._on_camera_moved()
 
@@ -92,7 +91,7 @@ class ClientSession:
 
     def view_image(self, index: int) -> None:
         """Move to the camera of a photograph, with the photograph over the model."""
-        camera, height = self.scene.capture.views[index].camera, camera_height(self.scene.capture)
+        camera, height = self.scene.capture.views[index].camera, self.scene.camera_height
         with self._lock:
             self._arrived = False
             self._display = replace(self._display, image_index=index)
@@ -138,7 +137,7 @@ class ClientSession:
         if index is None:
             return
         distance = float(np.linalg.norm(self.scene.capture.views[index].camera.position - camera.position))
-        if distance <= _IMAGE_POSE_TOLERANCE * camera_height(self.scene.capture):
+        if distance <= _IMAGE_POSE_TOLERANCE * self.scene.camera_height:
             self._arrived = True
         elif self._arrived:
             self._display = replace(self._display, image_index=None)
@@ -271,7 +270,7 @@ class ClientSession:
 
     def _add_points(self) -> Any:
         points, colors = overlays.sparse_points(self.scene)
-        size = 2e-3 * camera_height(self.scene.capture)
+        size = 2e-3 * self.scene.camera_height
         return self.client.scene.add_point_cloud("/points", points, colors, point_size=size, precision="float32")
 
 

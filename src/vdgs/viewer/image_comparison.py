@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.captures.image_cache import resize_area
 from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.geometry.camera import Camera
@@ -41,14 +40,10 @@ def nearest_view_index(scene: ViewerScene, camera: Camera) -> int:
 
     A distance of the flight's height counts as much as a turn of one radian (choice).
     """
-    height = camera_height(scene.capture)
-
-    def distance(index: int) -> float:
-        view = scene.capture.views[index].camera
-        turn = np.arccos(np.clip(float(view.forward @ camera.forward), -1.0, 1.0))
-        return float(np.linalg.norm(view.position - camera.position)) / height + float(turn)
-
-    return min(range(len(scene.capture.views)), key=distance)
+    positions, directions = scene.view_rays
+    turns = np.arccos(np.clip(directions @ camera.forward, -1.0, 1.0))
+    away = np.linalg.norm(positions - camera.position, axis=1)
+    return int(np.argmin(away / scene.camera_height + turns))
 
 
 class ImageComparison:

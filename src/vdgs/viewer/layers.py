@@ -12,7 +12,6 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import (
@@ -82,13 +81,12 @@ class Painter:
         if display.layer == "depth":
             from vdgs.rendering import scalar_maps
 
-            capture = self._scene.capture
             small = full_camera.limit_size(_PREVIEW_PX)
             name = self._scene.shown_name(display.model)
             shown = self._scene.shown(name, small, min_visibility=display.min_visibility)
             depth = scalar_maps.render_depth(shown, small)
-            depth_range = scalar_maps.depth_range([depth], camera_height(capture))
-            self._depth = scalar_maps.depth_scale(depth_range, capture.ground.unit)
+            depth_range = scalar_maps.depth_range([depth], self._scene.camera_height)
+            self._depth = scalar_maps.depth_scale(depth_range, self._scene.capture.ground.unit)
 
     def scale(self, display: DisplayOptions) -> ColorScale | None:
         """What the colors mean; None for images that need no legend."""

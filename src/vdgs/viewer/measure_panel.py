@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.captures.known_distances import MIN_OBSERVATIONS, MOST_APART
 from vdgs.system.quoting import shell_word
 from vdgs.viewer.measurement import SCALE_BAR_FILE, KnownDistance, MeasuredPoint, Ruler, known_distances_text
@@ -78,7 +77,7 @@ class MeasurePanel:
         points, scene = self.ruler.points(), self._session.client.scene
         added: Any = None
         if len(points) == 1:
-            radius = 4e-3 * camera_height(self._session.scene.capture)
+            radius = 4e-3 * self._session.scene.camera_height
             added = scene.add_icosphere("/measure", radius, color=_COLOR, position=tuple(points[0]))
         elif len(points) > 1:
             line = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)

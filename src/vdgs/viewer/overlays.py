@@ -8,7 +8,6 @@ import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.geometry.camera import Camera
 from vdgs.viewer.viewer_scene import ViewerScene, block_rgb
 
@@ -25,7 +24,7 @@ def block_borders(scene: ViewerScene) -> LineSegments:
     """The cores of the blocks as segments that lie on the ground, each in its block's color."""
     lines: list[np.ndarray] = []
     colors: list[tuple[int, int, int]] = []
-    step = _STEP * camera_height(scene.capture)
+    step = _STEP * scene.camera_height
     for index, block in enumerate(scene.blocks.items if scene.blocks is not None else ()):
         ring = shapely.get_coordinates(shapely.segmentize(block.core.exterior, max(step, block.core.length / 2000)))
         draped = np.column_stack([ring, _ground_below(scene, ring)])
@@ -49,7 +48,7 @@ def _ground_below(scene: ViewerScene, points_xy: Float[np.ndarray, "n 2"]) -> Fl
 def camera_frusta(scene: ViewerScene) -> LineSegments:
     """All cameras as small frusta, in the color of the block that they stand above."""
     views = scene.capture.views
-    size = _SIZE * camera_height(scene.capture)
+    size = _SIZE * scene.camera_height
     colors = [_GRAY] * len(views)
     if scene.blocks is not None:
         owners = scene.blocks.owner(np.stack([view.camera.position[:2] for view in views]))

@@ -91,7 +91,8 @@ class PathPanel:
 
 
 def path_json(keyframes: Sequence[Camera], seconds: float, closed: bool = False, fps: float = DEFAULT_FPS) -> str:
-    """The text of a camera path in the ground frame, of the size of its first key frame. Numbers keep all digits.
+    """The text of a camera path in the ground frame, of the size of its first key frame: others, of a window of another
+    shape, keep how high they see. Numbers keep all digits.
 
     Raises ValueError without key frames.
     """
@@ -101,7 +102,7 @@ def path_json(keyframes: Sequence[Camera], seconds: float, closed: bool = False,
     width, height = (max(2, size // 2 * 2) for size in (first.width, first.height))
     content = {
         "frame": "ground", "seconds": seconds, "fps": fps, "closed": closed, "interpolate": True,
-        "keyframes": [_keyframe_json(camera.resized(width, height)) for camera in keyframes],
+        "keyframes": [_keyframe_json(camera.reshaped(width, height)) for camera in keyframes],
     }  # fmt: skip
     return json.dumps(content, indent=1) + "\n"
 

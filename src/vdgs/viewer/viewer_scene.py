@@ -254,9 +254,20 @@ class ViewerScene:
         return torch.as_tensor(colors, dtype=torch.float32, device=places.device)
 
     @cached_property
+    def camera_height(self) -> float:
+        """How high the photographs were taken (`captures.camera_height`): it takes all sparse points to tell."""
+        return camera_height(self.capture)
+
+    @cached_property
+    def view_rays(self) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:
+        """From where, and in which direction (unit), each of `capture.views` looks."""
+        cameras = [view.camera for view in self.capture.views]
+        return np.array([each.position for each in cameras]), np.array([each.forward for each in cameras])
+
+    @cached_property
     def pixel_at_camera_height(self) -> float:
         """What a pixel of the photographs shows from their height, in units of the ground frame."""
-        return pixel_at_camera_height(camera_height(self.capture), (view.camera for view in self.capture.train_views))
+        return pixel_at_camera_height(self.camera_height, (view.camera for view in self.capture.train_views))
 
     @cached_property
     def images(self) -> ImageCache:

@@ -20,6 +20,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.image_cache import ImageCache
 from vdgs.geometry.camera import Camera
 from vdgs.model.renderer import Drawable, render
+from vdgs.visibility.visibility_counts import NearbyCameras
 
 #: Photographs looked up for one place; bytes of photographs, and depth maps, that are kept between tiles.
 _MAX_VIEWS, _IMAGE_CACHE_BYTES, _MAX_CACHED_DEPTHS = 12, 512_000_000, 32
@@ -63,6 +64,7 @@ class DetailTransfer:
     def __init__(self, model: Drawable, capture: Capture) -> None:
         self._model = model
         self._views = capture.train_views
+        self._cameras = NearbyCameras([view.camera for view in self._views])
         self._images = ImageCache(self._views, _IMAGE_CACHE_BYTES)
         self._depths: OrderedDict[int, Float[np.ndarray, "h w"]] = OrderedDict()
 
@@ -96,9 +98,10 @@ class DetailTransfer:
     def _select_views(self, points: Float[np.ndarray, "n 3"]) -> list[int]:
         """The photographs that are among the most trusted ones at any of the places."""
         some = points[:: max(1, len(points) // _SAMPLE_POINTS)]
-        trust = np.stack([_trust(view.camera, some) for view in self._views])
+        near = self._cameras.indices(torch.from_numpy(some))  # others are trusted nowhere here
+        trust = np.array([_trust(self._views[index].camera, some) for index in near]).reshape(len(near), len(some))
         most = (trust > 0) & (_TRUST_MARGIN * trust > _trust_threshold(trust))
-        return [int(index) for index in np.flatnonzero(most.any(axis=1))]
+        return [int(index) for index in near[most.any(axis=1)]]
 
     def _min_trust(self, chosen: list[int], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """How much a photograph must be trusted at each place to count there."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -26,14 +27,16 @@ class ClipHeight:
     """How high over a place the scene ends and the air in which cameras fly begins, in the ground frame."""
 
     cameras: Float[np.ndarray, "c 3"]
+    #: The sparse points, ascending in x: of millions, each tile looks at those about it.
     points: Float[np.ndarray, "p 3"]
     cameras_above_scene: bool
 
     @staticmethod
     def of(capture: Capture) -> ClipHeight:
         cameras = np.array([view.camera.position for view in capture.train_views])
-        flown = view_distance(cameras, capture.points, np.array([0.0, 0.0, 1.0])).is_height
-        return ClipHeight(cameras, capture.points, flown)
+        points = capture.points[np.argsort(capture.points[:, 0])]
+        flown = len(points) > 0 and view_distance(cameras, points, np.array([0.0, 0.0, 1.0])).is_height
+        return ClipHeight(cameras, points, flown)
 
     def height_above(self, point: Float[np.ndarray, "3"], radius: float) -> float:
         """z under which everything solid about `point` stands (choice).
@@ -43,15 +46,27 @@ class ClipHeight:
         the ceiling is above all points.
         """
         if not self.cameras_above_scene:
-            return max(float(self.points[:, 2].max()), float(self.cameras[:, 2].max())) + radius
+            return self._top + radius
         distances = np.hypot(*(self.cameras[:, :2] - point[:2]).T)
         flying = float(np.median(self.cameras[np.argsort(distances)[:_NUM_NEIGHBORS], 2]))
-        about = self.points[(np.abs(self.points[:, :2] - point[:2]) <= radius).all(axis=1), 2]
+        about = self._points_about(point, radius)[:, 2]
         if not len(about):
             return flying
         # Above the highest points by a tenth of their height: roofs are wider than the points on them.
         top, low = float(np.quantile(about, _POINT_QUANTILE)), float(np.median(about))
         return max(flying, top + 0.1 * (top - low))
+
+    @cached_property
+    def _top(self) -> float:
+        """z of the highest point or camera."""
+        return max(float(self.points[:, 2].max(initial=-np.inf)), float(self.cameras[:, 2].max()))
+
+    def _points_about(self, point: Float[np.ndarray, "3"], radius: float) -> Float[np.ndarray, "a 3"]:
+        """The points no farther than `radius` from `point` in x and in y."""
+        # Twice as far, so that no rounding leaves out one that is near.
+        first, last = np.searchsorted(self.points[:, 0], (point[0] - 2 * radius, point[0] + 2 * radius))
+        strip = self.points[first:last]
+        return strip[(np.abs(strip[:, :2] - point[:2]) <= radius).all(axis=1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +100,14 @@ class NadirCamera:
             height=grid.height, model="orthographic",
         )  # fmt: skip
 
+    @cached_property
+    def _ground_level(self) -> float:
+        """Height of the ground in the target's coordinates."""
+        return float(self.placement.project(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2])
+
     def _similarity(self, grid: PixelGrid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""
-        level = self.placement.project(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2]
+        level = self._ground_level
         center = self.placement.to_ground(np.array([[*grid.center, level]]))[0]
         similarity = self.placement.similarity_at(center)
         x0, y0, x1, y1 = grid.bounds

@@ -78,8 +78,9 @@ class OrthoPlan:
         scale = placement.similarity_at(pixel_grid.median_point(capture)).scale
         finest = pixel_grid.ground_sampling_distance(capture, scale)
         extent = pixel_grid.capture_extent(capture, placement)
-        grid = pixel_grid.grid_from_bbox(request.bbox or extent, finest if request.gsd is None else request.gsd)
-        pixel_grid.check_overlap(request.bbox or extent, extent, placement)
+        grid = pixel_grid.grid_of_map(capture, extent, finest, request.bbox, request.gsd)
+        if request.bbox is not None and extent is not None:
+            pixel_grid.check_overlap(request.bbox, extent, placement)
         above = NadirCamera.of(capture, placement)
         above.camera(grid.subgrid(0, 0, 1, 1))  # a system that makes no map is refused here
         return OrthoPlan(

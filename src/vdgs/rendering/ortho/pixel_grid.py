@@ -19,6 +19,8 @@ from vdgs.geometry.map_projection import MapProjection
 TILE_PX = 512
 #: A map ends beyond the points of the scene, but for a share of them on every side, by a share of its size (choice).
 _TRIM_QUANTILE, _MARGIN_SHARE = 0.002, 0.03
+#: From fewer points nothing is said of where the scene ends (choice).
+_MIN_POINTS = 10
 #: No map has more pixels: a hundred thousand each way.
 MAX_PIXELS = 10_000_000_000
 
@@ -61,6 +63,26 @@ class PixelGrid:
         return -(-self.width // side) * -(-self.height // side)
 
 
+def grid_of_map(
+    capture: Capture,
+    extent: tuple[float, float, float, float] | None,
+    finest: float | None,
+    bbox: tuple[float, float, float, float] | None,
+    gsd: float | None,
+) -> PixelGrid:
+    """The grid of the box and pixel size that are asked for, in their place of what the photographs show (`extent`)
+    and the size of their pixels (`finest`). Raises VdgsError where neither is known, and as `grid_from_bbox`."""
+    box, size = bbox or extent, finest if gsd is None else gsd
+    if size is None:
+        raise VdgsError(f"{capture.root}: no photograph holds a sparse point to measure its pixels by. Give --gsd.")
+    if box is None:
+        raise VdgsError(
+            f"{capture.root}: has fewer than {_MIN_POINTS} sparse points in {MIN_SEEN_BY} pictures or more, too few to "
+            "tell what a map should show. Give --bbox X0 Y0 X1 Y1."
+        )
+    return grid_from_bbox(box, size)
+
+
 def grid_from_bbox(bbox: tuple[float, float, float, float], gsd: float) -> PixelGrid:
     """The grid that covers x0, y0, x1, y1, its lines at multiples of `gsd`: maps of one scene lie on each other.
 
@@ -84,17 +106,12 @@ def grid_from_bbox(bbox: tuple[float, float, float, float], gsd: float) -> Pixel
     return PixelGrid(left * gsd, top * gsd, gsd, width, height)
 
 
-def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, float, float, float]:
-    """x0, y0, x1, y1 in target coordinates of what the training photographs show, by the sparse points.
-
-    Raises VdgsError where there are too few points to tell.
-    """
+def capture_extent(capture: Capture, placement: MapProjection) -> tuple[float, float, float, float] | None:
+    """x0, y0, x1, y1 in target coordinates of what the training photographs show, by the sparse points; None where
+    there are too few to tell."""
     shown = scene_points(capture)
-    if len(shown) < 10:
-        raise VdgsError(
-            f"{capture.root}: has {len(shown)} sparse points in {MIN_SEEN_BY} pictures or more, too few to tell what a "
-            "map should show. Give --bbox X0 Y0 X1 Y1."
-        )
+    if len(shown) < _MIN_POINTS:
+        return None
     low, high = np.quantile(placement.project(shown)[:, :2], [_TRIM_QUANTILE, 1 - _TRIM_QUANTILE], axis=0)
     beyond = _MARGIN_SHARE * (high - low)
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
@@ -116,15 +133,13 @@ def check_overlap(
         )
 
 
-def ground_sampling_distance(capture: Capture, scale: float) -> float:
+def ground_sampling_distance(capture: Capture, scale: float) -> float | None:
     """The median size of a pixel of the training photographs on what they show, in target units, to two digits.
 
-    `scale`: target units in one of the ground frame. Raises VdgsError where no photograph holds a sparse point.
+    `scale`: target units in one of the ground frame. None where no photograph holds a sparse point.
     """
     size = scene_gsd(capture)
-    if size is None:
-        raise VdgsError(f"{capture.root}: no photograph holds a sparse point to measure its pixels by. Give --gsd.")
-    return float(f"{scale * size:.2g}")
+    return None if size is None else float(f"{scale * size:.2g}")
 
 
 def ground_height(capture: Capture) -> float:

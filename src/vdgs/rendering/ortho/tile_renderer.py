@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from vdgs.model.renderer import Drawable, render
 from vdgs.rendering.ortho.detail_transfer import HALO_PX, DetailTransfer
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
-from vdgs.visibility.visibility_counts import count_visibility
+from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility
 
 #: At least this opaque, a pixel shows a surface: the median depth is that of half.
 MIN_ALPHA = 0.5
@@ -92,12 +93,17 @@ class TileRenderer:
         depth = _lower_median(_blocks(depth, self.samples))
         shown = (opacity >= MIN_ALPHA) & np.isfinite(depth)
         points = camera.unproject(np.where(shown, depth, 0.0))[shown]
-        cameras = [view.camera for view in self.nadir_camera.capture.train_views]
-        counts = count_visibility(torch.from_numpy(points), cameras).numpy()
+        places = torch.from_numpy(points)
+        counts = count_visibility(places, self._cameras.of(places)).numpy()
         visible = counts > 0  # what no photograph shows, the model invents
         shown[shown] = visible
         colors = light / np.maximum(opacity, MIN_ALPHA)[..., None]
         return _PixelSurfaces(colors, shown, points[visible], counts[visible])
+
+    @cached_property
+    def _cameras(self) -> NearbyCameras:
+        """The training cameras: a tile asks those about it."""
+        return NearbyCameras([view.camera for view in self.nadir_camera.capture.train_views])
 
 
 def _pad_camera(camera: Camera, by: int) -> Camera:
@@ -106,10 +112,10 @@ def _pad_camera(camera: Camera, by: int) -> Camera:
     return replace(camera, cx=camera.cx + by, cy=camera.cy + by, width=width, height=height)
 
 
-def samples_per_side(gsd: float, finest: float) -> int:
-    """Samples per pixel, each way, for a map coarser than the photographs: splats smaller than a pixel are drawn too
-    large (they get 0.3 px² each)."""
-    return int(np.clip(round(gsd / finest), 1, _MAX_SAMPLES))
+def samples_per_side(gsd: float, finest: float | None) -> int:
+    """Samples per pixel, each way, for a map coarser than the photographs (`finest`; None: not known): splats smaller
+    than a pixel are drawn too large (they get 0.3 px² each)."""
+    return 1 if finest is None else int(np.clip(round(gsd / finest), 1, _MAX_SAMPLES))
 
 
 def _blocks(values: np.ndarray, side: int) -> np.ndarray:
