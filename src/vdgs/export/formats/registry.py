@@ -48,6 +48,8 @@ class ExportFormat:
     max_coordinate: float = math.inf
     #: Whether its colors do not change with the direction: best baked so, where all files are of that kind.
     fixed_colors: bool = False
+    #: Whether it holds points without shapes, which stand where a map has them exactly.
+    only_points: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
     on_globe: bool = False
     #: How many Gaussians like these a file has room for, where that depends on what is asked of it.
@@ -72,7 +74,9 @@ class ExportFormat:
 
 #: The longer endings first: `.points.ply` and `.compressed.ply` are `.ply` too.
 FORMATS: tuple[ExportFormat, ...] = (
-    ExportFormat(suffix=".points.ply", description="point cloud, local coordinates", write=write_points),
+    ExportFormat(
+        suffix=".points.ply", description="point cloud, local coordinates", write=write_points, only_points=True
+    ),
     ExportFormat(
         suffix=".compressed.ply",
         description="PlayCanvas' compressed PLY, a quarter",
@@ -148,9 +152,14 @@ FORMATS: tuple[ExportFormat, ...] = (
         description="point cloud, map coordinates, compressed",
         write=write_laz,
         check=check_las_dependencies,
+        only_points=True,
     ),
     ExportFormat(
-        suffix=".las", description="point cloud, map coordinates", write=write_laz, check=check_las_dependencies
+        suffix=".las",
+        description="point cloud, map coordinates",
+        write=write_laz,
+        check=check_las_dependencies,
+        only_points=True,
     ),
 )
 
