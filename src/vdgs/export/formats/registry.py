@@ -14,7 +14,7 @@ from vdgs.export.formats.file_folders import FileFolder
 from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_page, html_capacity, read_html_chunks, write_html
-from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
+from vdgs.export.formats.point_cloud import MAX_LAS_COORDINATE, check_las, write_laz, write_points
 from vdgs.export.formats.rad import write_rad
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
@@ -151,14 +151,16 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".laz",
         description="point cloud, map coordinates, compressed",
         write=write_laz,
-        check=check_las_dependencies,
+        check=check_las,
+        max_coordinate=MAX_LAS_COORDINATE,
         only_points=True,
     ),
     ExportFormat(
         suffix=".las",
         description="point cloud, map coordinates",
         write=write_laz,
-        check=check_las_dependencies,
+        check=check_las,
+        max_coordinate=MAX_LAS_COORDINATE,
         only_points=True,
     ),
 )
