@@ -361,6 +361,26 @@ def test_only_files_of_ours_may_be_written_over(tmp_path, name):
     registry.check_not_foreign(path)
 
 
+@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.sog", "a.rad", "a.laz", "a.las", "lod-meta.json"])
+def test_facts_of_others_beside_a_file_stay(tmp_path, name):
+    beside = metadata_path(tmp_path / name)
+    beside.write_text('{"mine": 1}')
+    with pytest.raises(VdgsError, match=rf"{re.escape(beside.name)}: is there already and was not written by vdgs"):
+        registry.check_not_foreign(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.points.ply"])
+def test_a_coordinate_system_beside_a_ply_is_ours_where_the_ply_is(tmp_path, name):
+    path, beside = tmp_path / name, tmp_path / f"{name}.prj"
+    beside.write_text("PROJCS[mine]")
+    with pytest.raises(VdgsError, match=r"\.prj: is there already and was not written by vdgs"):
+        registry.check_not_foreign(path)
+    beside.unlink()
+    registry.write_scene(path, ExportScene.of(random_gaussians(20, 1), PLACED))
+    assert beside.is_file()
+    registry.check_not_foreign(path)
+
+
 def test_scenes_that_are_not_what_they_announce_are_refused(tmp_path):
     some = random_gaussians(20, 1)
     with pytest.raises(ValueError, match="21 Gaussians were announced, 20 came"):

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 
 from vdgs.export.formats.export_scene import ExportMetadata
+from vdgs.export.formats.gaussian_store import even_rows
 from vdgs.geometry.geodesy import enu_axes, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import MapProjection
@@ -63,8 +64,8 @@ class LocalFrame(Similarity):
         that is next to nothing."""
         if self.projection is None:
             return None
-        evenly = np.linspace(0, len(means) - 1, min(len(means), _DEPARTURE_SAMPLE)).astype(np.int64)
-        usual, largest = np.quantile(self._departures(means[evenly]), 0.99), self._departures(_outermost(means)).max()
+        evenly = means[even_rows(len(means), _DEPARTURE_SAMPLE)]
+        usual, largest = np.quantile(self._departures(evenly), 0.99), self._departures(_outermost(means)).max()
         if max(usual, largest) <= MAX_SILENT_DEPARTURE:
             return None
         return (

@@ -83,8 +83,13 @@ class GaussianStore:
 
     def sample(self, max_count: int) -> Gaussians:
         """At most so many, evenly taken."""
-        count = len(self.means)
-        return self.rows(np.unique(np.linspace(0, count - 1, min(max_count, count)).astype(np.int64)))
+        return self.rows(even_rows(len(self.means), max_count))
+
+
+def even_rows(count: int, most: int) -> Int[np.ndarray, " m"]:
+    """At most so many of `count` rows, ascending, evenly taken, first to last: in float64, for float32 would name rows
+    beyond the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
 
 
 def write_store(scene: ExportScene, file: Path, axes: Axes = Z_UP) -> GaussianStore:
