@@ -91,6 +91,19 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
         assert "copy it whole" in page.evaluate("document.body.innerText")
 
 
+def test_what_stands_alone_far_outside_keeps_nobody_from_coming_near(tmp_path):
+    gaussians = random_gaussians(300, 0)
+    gaussians.means[0] = torch.tensor([200_000.0, 0.0, 0.0])
+    camera = upright(np.array([2.0, -5.0, 6.0]), SIZE / 2 / np.tan(np.radians(FOV_DEG) / 2))
+    view = InitialView(tuple(camera.position), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    write_streamed_page(tmp_path / "scene.json", replace(ExportScene.of(gaussians), page=view), node_size=100)
+    expected = picture(gaussians, camera)
+    with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
+        wait_until(lambda: page.evaluate("document.body.dataset.state") == "complete")
+        page.evaluate("document.getElementById('caption').remove()")
+        wait_until(lambda: psnr(page.screenshot() / 255, expected) > 30)
+
+
 def test_a_view_is_drawn_as_finely_as_there_is_room_whatever_was_looked_at_before(tmp_path):
     """Parts of a view take the place of those of earlier ones, not of each other."""
     gaussians = random_gaussians(3000, 0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from rich.console import Console
 from support.captures import look_down
 from support.gaussians import random_gaussians
 from support.hand_made_models import capture_at, ground, model_at
+from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
 from vdgs.export import local_bake
@@ -27,6 +30,7 @@ from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, make_local_frame
 from vdgs.export.programs import PROGRAMS
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
+from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel, DecoderSpan
 from vdgs.model.gaussians import Gaussians, render_gaussians
 from vdgs.model.renderer import render
@@ -395,6 +399,36 @@ def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, mon
     sides = torch.where(torch.arange(200) % 2 == 0, 3000.0, -3000.0)
     with pytest.raises(VdgsError, match="2048"):
         export("a.spz", model=moved(scattered(), sides))
+
+
+def test_points_stand_where_the_map_has_them_and_gaussians_say_how_far_they_stand_off(export, tmp_path, monkeypatch):
+    """The Earth falls by 70 cm in 3 km: points agree with an elevation map of the same run."""
+    laspy = pytest.importorskip("laspy")
+    looking_down_at(monkeypatch, -3000.0, 3000.0)
+    wide = moved(scattered(), torch.where(torch.arange(200) % 2 == 0, 3000.0, -3000.0))
+    (plain,) = export("plain.ply", model=wide, origin=PLACE, crs="enu")["files"]
+    assert plain["notes"] == []
+    places = registry.read_gaussians(tmp_path / "plain.ply").means.double().numpy()
+    wanted = MapProjection.of(ground(PLACE), "EPSG:32632").project(places)
+
+    names = ("a.laz", "a.points.ply", "a.ply")
+    laz, points, ply = export(*names, model=wide, origin=PLACE, crs="EPSG:32632")["files"]
+    np.testing.assert_allclose(laspy.read(tmp_path / "a.laz").xyz, wanted, atol=0.002, rtol=0)
+    read, _ = read_point_cloud(tmp_path / "a.points.ply")
+    (header,) = re.findall(rb"comment origin (.*)\n", (tmp_path / "a.points.ply").read_bytes())
+    origin = np.array(json.loads(header))
+    np.testing.assert_allclose(read + origin, wanted, atol=0.002, rtol=0)
+    assert not any("curved map" in note for file in (laz, points) for note in file["notes"])
+    stored = registry.read_gaussians(tmp_path / "a.ply").means.double().numpy() + origin
+    off = np.linalg.norm(stored - wanted, axis=1).max()
+    assert off > 0.3
+    assert any(f"up to {off:.2f} m from their places" in note for note in ply["notes"])
+
+
+def test_a_small_scene_on_a_map_says_nothing(export):
+    pytest.importorskip("pyproj")
+    (file,) = export("a.ply", origin=PLACE, crs="EPSG:32632")["files"]
+    assert file["notes"] == []
 
 
 def test_a_scene_far_from_its_origin_is_placed_near_one(export, tmp_path, monkeypatch):

@@ -18,6 +18,7 @@ from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, InitialView
+from vdgs.export.formats.gaussian_store import even_rows
 from vdgs.model.gaussian_transform import gaussian_covariances
 
 PLACED = ExportMetadata(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
@@ -39,6 +40,13 @@ def test_a_page_holds_the_scene_in_any_unit(tmp_path, scale):
     camera = overhead(8.0)
     if scale == 1.0:
         assert psnr(picture(read, camera), picture(gaussians, camera)) > 38
+
+
+def test_a_sample_of_many_names_rows_that_are_there():
+    for count in (1, 5, (1 << 24) + 1, 50_000_000):
+        rows = even_rows(count, 1 << 15)
+        assert (rows[0], rows[-1]) == (0, count - 1)
+        assert len(np.unique(rows)) == len(rows) == min(count, 1 << 15)
 
 
 def test_a_page_says_what_few_cameras_see(tmp_path):

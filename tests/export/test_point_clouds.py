@@ -48,6 +48,46 @@ def test_without_a_map_coordinates_are_local(tmp_path):
     assert json.loads((tmp_path / "a.las.json").read_text())["geodetic"] == list(place)
 
 
+@pytest.mark.parametrize("reach", [1e-4, 0.5, 4000.0])
+def test_a_scene_of_unknown_size_keeps_its_points_apart(tmp_path, reach):
+    """A millimetre is nothing that such a scene has: steps go by how far it reaches."""
+    some = random_gaussians(300, 0, reach=reach)
+    origin = (5.5, -6.25, 7.0)
+    registry.write_scene(tmp_path / "a.las", ExportScene.of(some, ExportMetadata(origin, unit="units")))
+    off = laspy.read(tmp_path / "a.las").xyz - np.array(origin) - some.means.double().numpy()
+    assert np.abs(off).max() <= 1e-7 * reach
+
+
+@pytest.mark.parametrize("unit", ["metre", "US survey foot", "units"])
+def test_what_las_rounds_to_is_said(tmp_path, unit):
+    scene = ExportScene.of(random_gaussians(300, 0, reach=3.0), ExportMetadata(unit=unit))
+    notes = registry.write_scene(tmp_path / "a.las", scene)
+    step = laspy.read(tmp_path / "a.las").header.scales[0]
+    assert f"coordinates are rounded to {step:g} {unit}" in notes
+    assert step == (1e-7 if unit == "units" else 0.001)
+
+
+def test_what_las_does_not_reach_is_refused_before_work(tmp_path):
+    far = random_gaussians(5, 0)
+    far.means[3, 0] = 2.5e6
+    for bounds in (ExportScene.of(far).bounds, None):
+        with pytest.raises(VdgsError, match=r"lies 2\.5e\+06 units from the origin.*--bbox"):
+            registry.write_scene(tmp_path / "a.las", replace(ExportScene.of(far), bounds=bounds))
+    assert list(tmp_path.iterdir()) == []
+    unknown = replace(ExportScene.of(far), metadata=ExportMetadata(unit="units"))
+    registry.write_scene(tmp_path / "a.las", unknown)
+    assert laspy.read(tmp_path / "a.las").xyz.max() == 2.5e6
+
+
+def test_facts_of_an_earlier_file_without_a_map_go(tmp_path):
+    """Beside a file that knows its map they would tell another place."""
+    some = random_gaussians(5, 0)
+    registry.write_scene(tmp_path / "a.las", ExportScene.of(some, ExportMetadata((5.0, 6.0, 7.0), unit="units")))
+    assert (tmp_path / "a.las.json").is_file()
+    registry.write_scene(tmp_path / "a.las", ExportScene.of(some, ExportMetadata(ORIGIN, "EPSG:32632")))
+    assert not (tmp_path / "a.las.json").exists()
+
+
 def test_a_wrong_map_is_refused_before_work(tmp_path):
     with pytest.raises(VdgsError, match="'EPSG:1' is not understood"):
         registry.check_export(

@@ -15,7 +15,7 @@ import torch
 from support.gaussians import overhead, picture, psnr, random_gaussians, turned
 from support.splat_readers import independent
 from vdgs.errors import VdgsError
-from vdgs.export.formats import export_scene, registry, spz
+from vdgs.export.formats import export_scene, registry, sog, spz
 from vdgs.export.formats.axes import Y_DOWN, Y_UP
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metadata_path
 from vdgs.export.formats.gaussian_ply import read_ply_chunks
@@ -229,6 +229,21 @@ def test_a_sog_is_read_by_others(tmp_path, degree):
         assert json.loads(bundle.read("meta.json"))["count"] == 500
 
 
+def test_a_sog_keeps_the_few_that_are_larger_and_brighter_than_all_others(tmp_path, monkeypatch):
+    """Backdrops and water: a sample of a large scene does not hold them."""
+    monkeypatch.setattr(sog, "SAMPLE_ROWS", 100)
+    written = random_gaussians(5000, 0)
+    few = torch.arange(7, 5000, 500)
+    written.log_scales[few, 0] = torch.linspace(2.0, 3.5, len(few))
+    written.log_scales[few + 1, 1] = -9.0
+    written.sh0[few, 2] = torch.linspace(4.0, 6.0, len(few))
+    registry.write_scene(tmp_path / "a.sog", ExportScene.of(written))
+    read, wanted = independent(tmp_path / "a.sog"), turned(written, Y_DOWN.turn)
+    read = read.select(torch.cdist(wanted.means, read.means).argmin(1))
+    torch.testing.assert_close(read.log_scales, wanted.log_scales, atol=0.1, rtol=0)
+    torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.1, rtol=0)
+
+
 def glb_arrays(path: Path) -> tuple[pygltflib.GLTF2, dict[str, np.ndarray]]:
     """A GLB as pygltflib reads it, and the numbers of every attribute."""
     gltf = pygltflib.GLTF2().load(str(path))
@@ -343,6 +358,26 @@ def test_only_files_of_ours_may_be_written_over(tmp_path, name):
         registry.check_not_foreign(path)
     path.unlink()
     registry.write_scene(path, ExportScene.of(random_gaussians(20, 1)))
+    registry.check_not_foreign(path)
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.sog", "a.rad", "a.laz", "a.las", "lod-meta.json"])
+def test_facts_of_others_beside_a_file_stay(tmp_path, name):
+    beside = metadata_path(tmp_path / name)
+    beside.write_text('{"mine": 1}')
+    with pytest.raises(VdgsError, match=rf"{re.escape(beside.name)}: is there already and was not written by vdgs"):
+        registry.check_not_foreign(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.points.ply"])
+def test_a_coordinate_system_beside_a_ply_is_ours_where_the_ply_is(tmp_path, name):
+    path, beside = tmp_path / name, tmp_path / f"{name}.prj"
+    beside.write_text("PROJCS[mine]")
+    with pytest.raises(VdgsError, match=r"\.prj: is there already and was not written by vdgs"):
+        registry.check_not_foreign(path)
+    beside.unlink()
+    registry.write_scene(path, ExportScene.of(random_gaussians(20, 1), PLACED))
+    assert beside.is_file()
     registry.check_not_foreign(path)
 
 

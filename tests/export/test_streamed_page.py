@@ -1,6 +1,7 @@
 """The folder for a web server: its tree holds the scene, and no page of others is overwritten."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -37,6 +38,14 @@ def test_the_leaves_hold_the_scene_and_nodes_above_fewer(tmp_path):
     assert len(files) == 1 + count
     registry.write_scene(path, ExportScene.of(some))
     assert sorted(each.name for each in tmp_path.iterdir()) == ["index.html", "nodes-2", "scene.json"]
+
+
+def test_a_browser_asks_whether_what_it_holds_is_still_right(tmp_path):
+    """A server of files says only when they changed, so browsers would hold an old tree for long."""
+    registry.write_scene(tmp_path / "scene.json", ExportScene.of(random_gaussians(20, 0)))
+    page = (tmp_path / "index.html").read_text()
+    assert 'FRESH = { cache: "no-cache" }' in page
+    assert re.findall(r"fetch\(([^)]*)\)", page) == ['"scene.json", FRESH', "node.uri, FRESH"]
 
 
 def test_a_page_of_others_stays(tmp_path):

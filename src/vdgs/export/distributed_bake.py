@@ -69,7 +69,7 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 class DistributedBake:
-    """Lets shards bake the scene of a run, step by step; as `BakedHere`."""
+    """Lets shards bake the scene of a run, step by step; as `LocalBake`."""
 
     def __init__(
         self, run: OpenedRun, request: ExportRequest, work: BakePlan, wish: ExecutionOptions, console: Console

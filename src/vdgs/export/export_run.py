@@ -75,7 +75,8 @@ class _BakedScene:
 
     def scene(self, frame: LocalFrame, rows: Int[np.ndarray, " r"], path: Path) -> ExportScene:
         """What a writer is given for a file: the Gaussians of these rows."""
-        chunks = (frame.to_local(piece) for piece in self.pieces(rows))
+        to_local = frame.points_to_local if registry.format_from_path(path).only_points else frame.to_local
+        chunks = (to_local(piece) for piece in self.pieces(rows))
         bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
         axes = axes_for(path, self.request)
         return ExportScene(
@@ -240,6 +241,8 @@ def _write_fitting(
     if count < len(rows):
         notes.append(f"merged from {len(rows):,} Gaussians to {count:,}, which the file has room for")
         scene, rows = replace(scene, spool=merging.merged(count).spool), np.arange(count)
+    if not registry.format_from_path(path).only_points and (note := frame.departure_note(scene.spool.means[rows])):
+        notes.append(note)
     return _write(path, scene.scene(frame, rows, path), merging.console, notes)
 
 

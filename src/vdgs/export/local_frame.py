@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from vdgs.export.formats.export_scene import ExportMetadata
+from vdgs.export.formats.gaussian_store import even_rows
 from vdgs.geometry.geodesy import enu_axes, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import MapProjection
@@ -22,6 +24,10 @@ MAX_LOCAL_COORDINATE = 10_000.0
 IDENTITY_TOLERANCE = 1e-9
 #: Origins are whole multiples of this, so that people can type them.
 ORIGIN_STEP = 100.0
+#: Where Gaussians stand farther than this (m) from where the map has them, it is said.
+MAX_SILENT_DEPARTURE = 0.01
+#: So many Gaussians, evenly taken, and so many of the outermost tell how far.
+_DEPARTURE_SAMPLE, _OUTERMOST = 10_000, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +35,8 @@ class LocalFrame(Similarity):
     """From the ground frame to local coordinates, and what a file says of these."""
 
     facts: ExportMetadata
+    #: The map, where it is curved against the ground frame; None where the similarity is exact.
+    projection: MapProjection | None = None
 
     @property
     def is_identity(self) -> bool:
@@ -43,6 +51,40 @@ class LocalFrame(Similarity):
             if self.is_identity
             else transform_gaussians(gaussians, self.scale, self.rotation, self.translation)
         )
+
+    def points_to_local(self, gaussians: Gaussians) -> Gaussians:
+        """The same with their means where the map has them exactly: for files of points, which have no shapes."""
+        if self.projection is None:
+            return self.to_local(gaussians)
+        means = torch.from_numpy(self._map_points(gaussians.means.cpu().double().numpy()).astype(np.float32))
+        return replace(gaussians, means=means)
+
+    def departure_note(self, means: Float[np.ndarray, "n 3"]) -> str | None:
+        """How far Gaussians of these means (ground frame) stand from where the map has them, for people; None where
+        that is next to nothing."""
+        if self.projection is None:
+            return None
+        evenly = means[even_rows(len(means), _DEPARTURE_SAMPLE)]
+        usual, largest = np.quantile(self._departures(evenly), 0.99), self._departures(_outermost(means)).max()
+        if max(usual, largest) <= MAX_SILENT_DEPARTURE:
+            return None
+        return (
+            f"one similarity, right in the middle of the scene, puts all Gaussians on the curved map: they stand up to "
+            f"{max(usual, largest):.2f} m from their places (99 of 100 within {usual:.2f} m), mostly in height. Exact "
+            "are .laz, .las, .points.ply and, in --crs enu, all files"
+        )
+
+    def _departures(self, means: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Metres between where the similarity and the map put points of the ground frame."""
+        assert self.projection is not None
+        points = means.astype(np.float64)
+        apart: np.ndarray = np.linalg.norm(self.apply(points) - self._map_points(points), axis=1)
+        return apart * (self.projection.meters_per_unit or 1.0)
+
+    def _map_points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points of the ground frame in local coordinates, by the map."""
+        assert self.projection is not None
+        return self.projection.project(points) - self.facts.origin
 
     def to_ground(self, gaussians: Gaussians) -> Gaussians:
         """The inverse of `to_local`."""
@@ -59,11 +101,11 @@ def make_local_frame(
 ) -> LocalFrame:
     """The local coordinates of a system (`MapProjection.of`) about a scene whose middle is `center` (ground frame).
 
-    Gaussians take the similarity that is right about the center: over a kilometre a projection departs from it by
-    centimetres, mostly in height (the Earth is round). A middle that is more than `max_coordinate` from the origin of
-    the system gets an origin of its own; in `enu` that is a place on Earth, about which x is east, y north and z up
-    again, so that what says of the file where it stands is one thing, its latitude, longitude and height. Raises
-    VdgsError for a system that cannot be had.
+    Gaussians take the similarity that is right about the center: a projection departs from it, mostly in height (the
+    Earth is round), by centimetres a kilometre away and by metres at five (`departure_note`). A middle that is more
+    than `max_coordinate` from the origin of the system gets an origin of its own; in `enu` that is a place on Earth,
+    about which x is east, y north and z up again, so that what says of the file where it stands is one thing, its
+    latitude, longitude and height. Raises VdgsError for a system that cannot be had.
     """
     placement = MapProjection.of(ground, crs)
     similarity = placement.similarity_at(center)
@@ -75,7 +117,16 @@ def make_local_frame(
         rotation, translation = turn @ similarity.rotation, turn @ (similarity.translation - origin)
         return LocalFrame(similarity.scale, rotation, translation, ExportMetadata(unit=unit, geodetic=geodetic))
     facts = ExportMetadata((float(origin[0]), float(origin[1]), float(origin[2])), placement.wkt, unit)
-    return LocalFrame(similarity.scale, similarity.rotation, similarity.translation - origin, facts)
+    curved = placement if placement.wkt is not None else None
+    return LocalFrame(similarity.scale, similarity.rotation, similarity.translation - origin, facts, curved)
+
+
+def _outermost(means: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Those farthest from the middle."""
+    if len(means) <= _OUTERMOST:
+        return means
+    squares = ((means - np.median(means, axis=0)) ** 2).sum(1)
+    return means[np.argpartition(squares, -_OUTERMOST)[-_OUTERMOST:]]
 
 
 def _geodetic_at(

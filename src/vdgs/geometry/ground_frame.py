@@ -8,6 +8,9 @@ import numpy as np
 
 from vdgs.geometry.similarity import Similarity
 
+#: What a unit of coordinates is called whose size nobody knows.
+UNKNOWN_UNIT = "units"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GroundFrame(Similarity):
@@ -45,7 +48,7 @@ class GroundFrame(Similarity):
     @property
     def unit(self) -> str:
         """What one unit of the ground frame is called."""
-        return "m" if self.metric else "units"
+        return "m" if self.metric else UNKNOWN_UNIT
 
     @property
     def axis_names(self) -> tuple[str, str]:

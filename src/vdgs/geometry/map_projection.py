@@ -17,7 +17,7 @@ from jaxtyping import Float
 from vdgs.errors import VdgsError
 from vdgs.geometry.crs import CrsTransform, open_crs, utm_epsg
 from vdgs.geometry.geodesy import enu_axes, enu_from_geodetic, geodetic_from_enu
-from vdgs.geometry.ground_frame import GroundFrame
+from vdgs.geometry.ground_frame import UNKNOWN_UNIT, GroundFrame
 from vdgs.geometry.similarity import Similarity
 
 MapPoints = Float[np.ndarray, "n 3"]
@@ -128,7 +128,7 @@ def _local(ground: GroundFrame) -> MapProjection:
 
 def _source(ground: GroundFrame) -> MapProjection:
     meters = ground.scale if ground.metric else None
-    unit = "m" if meters is not None and abs(meters - 1) < 1e-9 else "units"
+    unit = "m" if meters is not None and abs(meters - 1) < 1e-9 else UNKNOWN_UNIT
     name, heights = "the capture's own coordinates", "the third coordinate of the capture's own world"
     return MapProjection(
         crs="source", name=name, unit=unit, meters_per_unit=meters, wkt=None, height_reference=heights, notes=(),

@@ -7,14 +7,15 @@ from jaxtyping import Float, Int
 
 #: Entries of a codebook of numbers.
 CODEBOOK_SIZE = 256
-#: So many numbers and rows are enough to learn from.
-SAMPLE_VALUES, SAMPLE_ROWS = 1 << 19, 1 << 16
+#: So many rows are enough to learn from.
+SAMPLE_ROWS = 1 << 16
 LLOYD_ITERATIONS = 20
 
 
-def fit_codebook(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "256"]:
-    """256 ascending values with small squared distances to the numbers (Lloyd's iteration on sorted numbers)."""
-    numbers = np.sort(_sample(values, SAMPLE_VALUES).astype(np.float64))
+def fit_codebook(sample: Float[np.ndarray, " n"], low: float, high: float) -> Float[np.ndarray, "256"]:
+    """256 ascending values with small squared distances to numbers (Lloyd's iteration on sorted numbers), learnt from a
+    sample of them and from the least and the largest of all: the few that the sample lacks are not cut off."""
+    numbers = np.sort(np.append(sample.astype(np.float64), [low, high]))
     # Half by rank, half by place: crowds are told apart, and what is rare is not rounded far.
     ranks = np.quantile(numbers, (np.arange(CODEBOOK_SIZE // 2) + 0.5) / (CODEBOOK_SIZE // 2))
     entries = np.sort(np.concatenate([ranks, np.linspace(numbers[0], numbers[-1], CODEBOOK_SIZE - len(ranks))]))
@@ -48,8 +49,3 @@ class VectorCodebook:
         step = max(1, (1 << 25) // len(self.rows))
         parts = [(squares - rows[i : i + step] @ self.rows.T).argmin(1) for i in range(0, len(rows), step)]
         return np.concatenate(parts)
-
-
-def _sample(values: np.ndarray, max_count: int) -> np.ndarray:
-    """Evenly taken, first to last."""
-    return values if len(values) <= max_count else values[np.linspace(0, len(values) - 1, max_count).astype(np.int64)]

@@ -59,6 +59,15 @@ class GaussianStore:
         if len(rows):
             self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
 
+    def value_range(self) -> tuple[Gaussians, Gaussians]:
+        """The least and the largest value of each number of all Gaussians, as one Gaussian each."""
+        low = high = np.array(self.table[:1])
+        for first in range(0, len(self.table), CHUNK_SIZE):
+            part = self.table[first : first + CHUNK_SIZE]
+            low, high = np.minimum(low, part.min(0)), np.maximum(high, part.max(0))
+            self.release_pages()
+        return _unflatten(torch.from_numpy(low), self.shapes), _unflatten(torch.from_numpy(high), self.shapes)
+
     def release_pages(self) -> None:
         """Leave to the system which pages of the file lie in memory. They do not count as this process' own then, and
         are there again when they are asked for. Called now and then by who looks at all Gaussians."""
@@ -74,8 +83,13 @@ class GaussianStore:
 
     def sample(self, max_count: int) -> Gaussians:
         """At most so many, evenly taken."""
-        count = len(self.means)
-        return self.rows(np.unique(np.linspace(0, count - 1, min(max_count, count)).astype(np.int64)))
+        return self.rows(even_rows(len(self.means), max_count))
+
+
+def even_rows(count: int, most: int) -> Int[np.ndarray, " m"]:
+    """At most so many of `count` rows, ascending, evenly taken, first to last: in float64, for float32 would name rows
+    beyond the last."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(np.int64))
 
 
 def write_store(scene: ExportScene, file: Path, axes: Axes = Z_UP) -> GaussianStore:

@@ -32,6 +32,7 @@ from vdgs.export.formats.export_scene import (
     opacities,
     to_uint8,
 )
+from vdgs.export.formats.gaussian_store import even_rows
 from vdgs.kernels.spherical_harmonics import rgb_to_sh
 from vdgs.model.gaussian_merging import ellipsoid_axes, group_neighbors, merge_by_moments
 from vdgs.model.gaussian_transform import gaussian_covariances
@@ -141,8 +142,7 @@ def _without_sh(scene: ExportScene) -> Gaussians:
 
 def html_capacity(gaussians: Gaussians, page: InitialView) -> int:
     """How many like these a page has room for, by a sample of them. Raises VdgsError for next to none."""
-    sampled = min(SAMPLE_GAUSSIANS, len(gaussians))
-    some = gaussians.select(torch.linspace(0, len(gaussians) - 1, sampled, dtype=torch.float32, device="cpu").long())
+    some = gaussians.select(torch.from_numpy(even_rows(len(gaussians), SAMPLE_GAUSSIANS)))
     frame = _frame_bytes()
     factor = length_factor(some)
     each = SIZE_MARGIN * len(_recording(packed_rows(some, factor), factor, page)) / len(some)

@@ -6,6 +6,7 @@ What is faint is written too: opacity goes along (LAS: as intensity, 0 .. 65535)
 from __future__ import annotations
 
 import importlib.util
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +18,13 @@ from vdgs.export.formats.export_scene import (
     ExportMetadata,
     ExportScene,
     base_colors,
+    metadata_path,
     opacities,
     to_uint8,
     write_metadata_file,
 )
 from vdgs.export.formats.gaussian_ply import write_vertices
+from vdgs.geometry.ground_frame import UNKNOWN_UNIT
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
 
@@ -29,8 +32,14 @@ if TYPE_CHECKING:
     import laspy
 
 POINT_DTYPE = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("opacity", "<f4")])
-#: LAS keeps whole numbers of this, in units of the coordinates.
+#: LAS keeps whole numbers of this, where the unit of the coordinates is known.
 LAS_SCALE = 0.001
+#: Where it is not, of this part of how far they reach: what float32 holds.
+LAS_RELATIVE_SCALE = 1e-7
+#: The whole numbers are below this.
+LAS_RANGE = 2**31
+#: Coordinates of a known unit lie below this, from the origin.
+MAX_LAS_COORDINATE = LAS_RANGE * LAS_SCALE
 LOSS_NOTES = ("sizes, rotations and changing colors are left out: these are points",)
 
 
@@ -48,8 +57,8 @@ def write_points(path: Path, scene: ExportScene) -> tuple[str, ...]:
     return LOSS_NOTES
 
 
-def check_las_dependencies(path: Path, scene: ExportScene) -> None:
-    """Raise VdgsError where packages are missing that LAS and LAZ need."""
+def check_las(path: Path, scene: ExportScene) -> None:
+    """Raise VdgsError where packages are missing that LAS and LAZ need, or positions are known not to fit."""
     needed = [
         "laspy",
         *(["lazrs"] if path.suffix.lower() == ".laz" else []),
@@ -60,19 +69,39 @@ def check_las_dependencies(path: Path, scene: ExportScene) -> None:
         raise VdgsError(f"{path}: needs {' and '.join(missing)}, not installed. Install with: pip install 'vdgs[geo]'")
     if scene.metadata.crs:
         _crs(path, scene.metadata.crs)
+    if scene.bounds is not None:
+        _check_reach(path, np.array(scene.bounds), _las_scale(scene))
+
+
+def _las_scale(scene: ExportScene) -> float:
+    """Whole numbers in the file count this, in units of the coordinates: a power of ten."""
+    if scene.metadata.unit != UNKNOWN_UNIT or scene.bounds is None:
+        return LAS_SCALE
+    reach = float(np.abs(scene.bounds).max()) or 1.0
+    return float(10.0 ** math.floor(math.log10(reach * LAS_RELATIVE_SCALE)))
+
+
+def _check_reach(path: Path, positions: np.ndarray, scale: float) -> None:
+    """Raise VdgsError where local positions are beyond what whole numbers of `scale` reach."""
+    far = float(np.abs(positions).max())
+    if far >= 0.999 * LAS_RANGE * scale:
+        raise VdgsError(
+            f"{path}: a Gaussian lies {far:.4g} units from the origin; LAS reaches {LAS_RANGE * scale:.4g} in steps of "
+            f"{scale:g}. Leave it out (--bbox), or write .points.ply."
+        )
 
 
 def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write a LAS 1.4 or, by the ending, LAZ file at origin + local coordinates, atomically, with the CRS as WKT; where
-    there is none, the place of the origin stands in a `FILE.json` beside it.
+    there is none, the place of the origin stands in a `FILE.json` beside it; one of an earlier export goes.
 
     Returns what was lost. Raises VdgsError.
     """
-    check_las_dependencies(path, scene)
+    check_las(path, scene)
     import laspy
 
-    compressed = path.suffix.lower() == ".laz"
-    header = _las_header(path, scene.metadata)
+    compressed, scale = path.suffix.lower() == ".laz", _las_scale(scene)
+    header = _las_header(path, scene.metadata, scale)
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file, laspy.open(
@@ -80,21 +109,24 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
         ) as writer:  # fmt: skip
             origin = np.array(scene.metadata.origin)
             for piece in scene.pieces():
+                _check_reach(path, piece.means.numpy(), scale)
                 writer.write_points(_las_points(piece.means.double().numpy() + origin, to_uint8(base_colors(piece)),
                                                 opacities(piece), header))  # fmt: skip
 
     write_atomic(path, write)
-    if not scene.metadata.crs:
+    if scene.metadata.crs:
+        metadata_path(path).unlink(missing_ok=True)
+    else:
         write_metadata_file(path, scene.metadata, Z_UP)
-    return LOSS_NOTES
+    return (*LOSS_NOTES, f"coordinates are rounded to {scale:g} {scene.metadata.unit}")
 
 
-def _las_header(path: Path, metadata: ExportMetadata) -> laspy.LasHeader:
+def _las_header(path: Path, metadata: ExportMetadata, scale: float) -> laspy.LasHeader:
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=7)
-    header.scales = np.full(3, LAS_SCALE)
-    header.offsets = np.floor(np.array(metadata.origin))
+    header.scales = np.full(3, scale)
+    header.offsets = np.array(metadata.origin)
     header.generating_software = metadata.program[:32]
     if metadata.crs:
         header.add_crs(_crs(path, metadata.crs))

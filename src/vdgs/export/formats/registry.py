@@ -11,10 +11,10 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
 from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate, metadata_path
 from vdgs.export.formats.file_folders import FileFolder
-from vdgs.export.formats.gaussian_ply import read_ply_chunks, write_ply
+from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_page, html_capacity, read_html_chunks, write_html
-from vdgs.export.formats.point_cloud import check_las_dependencies, write_laz, write_points
+from vdgs.export.formats.point_cloud import MAX_LAS_COORDINATE, check_las, write_laz, write_points
 from vdgs.export.formats.rad import write_rad
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
@@ -31,7 +31,7 @@ _PROGRAM, _HEAD_BYTES = b"vdgs", 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class ExportFormat:
-    """One kind of file. `write_scene` returns a sentence for each thing that was lost."""
+    """One kind of file. `write` returns a sentence for each thing that was lost."""
 
     #: How the file's name ends, in lower case.
     suffix: str
@@ -44,10 +44,14 @@ class ExportFormat:
     check: Callable[[Path, ExportScene], None] = lambda path, scene: None
     #: Whether facts are written to FILE.json, for the format has no room for them.
     writes_metadata_file: bool = False
+    #: Which file beside it is written or removed with it, where there is one.
+    facts_file: Callable[[Path], Path] | None = None
     #: Coordinates lie below this, from the origin.
     max_coordinate: float = math.inf
     #: Whether its colors do not change with the direction: best baked so, where all files are of that kind.
     fixed_colors: bool = False
+    #: Whether it holds points without shapes, which stand where a map has them exactly.
+    only_points: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
     on_globe: bool = False
     #: How many Gaussians like these a file has room for, where that depends on what is asked of it.
@@ -72,14 +76,27 @@ class ExportFormat:
 
 #: The longer endings first: `.points.ply` and `.compressed.ply` are `.ply` too.
 FORMATS: tuple[ExportFormat, ...] = (
-    ExportFormat(suffix=".points.ply", description="point cloud, local coordinates", write=write_points),
+    ExportFormat(
+        suffix=".points.ply",
+        description="point cloud, local coordinates",
+        write=write_points,
+        facts_file=beside_ply,
+        only_points=True,
+    ),
     ExportFormat(
         suffix=".compressed.ply",
         description="PlayCanvas' compressed PLY, a quarter",
         write=write_compressed_ply,
         read=compressed_ply_pieces,
+        facts_file=beside_ply,
     ),
-    ExportFormat(suffix=".ply", description="3DGS PLY, nothing lost", write=write_ply, read=read_ply_chunks),
+    ExportFormat(
+        suffix=".ply",
+        description="3DGS PLY, nothing lost",
+        write=write_ply,
+        read=read_ply_chunks,
+        facts_file=beside_ply,
+    ),
     ExportFormat(
         suffix=".spz",
         description="SPZ, a sixth of the PLY or less",
@@ -87,6 +104,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         read=read_spz_chunks,
         check=check_range,
         writes_metadata_file=True,
+        facts_file=metadata_path,
         max_coordinate=MAX_COORDINATE,
     ),
     ExportFormat(
@@ -95,14 +113,22 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_splat,
         read=read_splat_chunks,
         writes_metadata_file=True,
+        facts_file=metadata_path,
     ),
     ExportFormat(
         suffix=".sog",
         description="PlayCanvas' SOG, a twelfth of the PLY or less",
         write=write_sog,
         writes_metadata_file=True,
+        facts_file=metadata_path,
     ),
-    ExportFormat(suffix=".rad", description="Spark's RAD, with levels", write=write_rad, writes_metadata_file=True),
+    ExportFormat(
+        suffix=".rad",
+        description="Spark's RAD, with levels",
+        write=write_rad,
+        writes_metadata_file=True,
+        facts_file=metadata_path,
+    ),
     ExportFormat(
         suffix=".glb",
         description="glTF with KHR_gaussian_splatting, nothing lost",
@@ -123,6 +149,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_streamed_sog,
         check=check_lod_folder,
         writes_metadata_file=True,
+        facts_file=metadata_path,
         folder=LOD_FOLDER,
     ),
     ExportFormat(
@@ -147,10 +174,19 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".laz",
         description="point cloud, map coordinates, compressed",
         write=write_laz,
-        check=check_las_dependencies,
+        check=check_las,
+        max_coordinate=MAX_LAS_COORDINATE,
+        facts_file=metadata_path,
+        only_points=True,
     ),
     ExportFormat(
-        suffix=".las", description="point cloud, map coordinates", write=write_laz, check=check_las_dependencies
+        suffix=".las",
+        description="point cloud, map coordinates",
+        write=write_laz,
+        check=check_las,
+        max_coordinate=MAX_LAS_COORDINATE,
+        facts_file=metadata_path,
+        only_points=True,
     ),
 )
 
@@ -166,8 +202,14 @@ def format_from_path(path: Path) -> ExportFormat:
 
 
 def check_not_foreign(path: Path) -> None:
-    """Raise VdgsError where a file stands at the path that says nowhere, nor its FILE.json, that vdgs wrote it."""
-    check_ours(path, *([metadata_path(path)] if format_from_path(path).writes_metadata_file else []))
+    """Raise VdgsError where a file stands at the path that says nowhere, nor its FILE.json, that vdgs wrote it; or at
+    that of FILE.json or FILE.prj one that is not ours."""
+    chosen = format_from_path(path)
+    check_ours(path, *([metadata_path(path)] if chosen.writes_metadata_file else []))
+    if chosen.facts_file is metadata_path:
+        check_ours(metadata_path(path))
+    elif chosen.facts_file is not None:
+        check_ours(chosen.facts_file(path), path)  # names no program: it is ours beside a file of ours
 
 
 def check_ours(path: Path, *beside: Path) -> None:
