@@ -64,7 +64,7 @@ def _is_in_box(
     placement = MapProjection.of(run.capture.ground, request.crs or default_crs(run.capture.ground, request.output[0]))
     means = gaussian_means(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
     places = placement.project(means)[:, :2]
-    inside: np.ndarray = ((places >= (x0, y0)) & (places <= (x1, y1))).all(1)
+    inside = np.asarray(((places >= (x0, y0)) & (places <= (x1, y1))).all(1))
     if among.any() and not (inside & among).any():
         low, high = places[among].min(0), places[among].max(0)
         what = "the scene" if request.block is None else f"block {request.block}"
