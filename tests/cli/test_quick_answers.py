@@ -225,6 +225,35 @@ def test_photographs_that_lie_elsewhere_are_looked_at_too(native_small: NativeRu
     assert nothing_to_do(asked, "") == ""
 
 
+@pytest.mark.parametrize("capture_is", ["a project file", "the folder"])
+def test_a_run_beside_photographs_is_none_of_them(native_small: NativeRun, tmp_path, capture_is):
+    """Neither what stages write after capture.json, nor another run or a log beside it, is a change of the capture."""
+    place = shutil.copytree(native_small.capture, tmp_path / "place")
+    project = place / "project.xml"
+    project.touch()
+    photographs = [shutil.copy(file, place) for file in (place / "images").iterdir()]
+    run = shutil.copytree(native_small.whole, place / "run")
+    cameras = json.loads((run / "cameras.json").read_text())
+    write_json(run / "cameras.json", cameras | {"input_folders": ["."]})
+    capture = project if capture_is == "a project file" else place
+    RunFolder(run).move_capture(capture)
+    own = RunFolder(run).settings()
+    asked = RunRequest(capture=capture, output=run, ortho=False, options=own.capture, **vars(own.method))
+    for file in place.rglob("*"):
+        set_time(file, -200)
+    set_time(run / "capture.json", -100)
+    vdgs("report", run)
+    shutil.copytree(run, place / "another run")
+    if capture_is == "a project file":
+        (place / "run.log").touch()
+    assert nothing_to_do(asked, "").startswith("nothing to do")
+    set_time(Path(photographs[0]), 0)
+    assert nothing_to_do(asked, "") == ""
+    set_time(Path(photographs[0]), -200)
+    shutil.copyfile(photographs[0], place / "added.png")
+    assert nothing_to_do(asked, "") == ""
+
+
 def test_a_folder_that_an_option_names_is_looked_at_with_all_below(tmp_path):
     place, mask = tmp_path / "place", tmp_path / "masks" / "below" / "new.png"
     place.mkdir()

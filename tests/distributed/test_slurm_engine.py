@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import pytest
 
 from vdgs.config.executor_options import SlurmOptions
 from vdgs.distributed import slurm_commands, slurm_executor
-from vdgs.distributed.executor import LogListener, Task, TaskResources, TaskResult
+from vdgs.distributed.executor import EXIT_STOPPED, AttemptResult, LogListener, Task, TaskResources, TaskResult
 from vdgs.distributed.node_check import NodeRequirements
+from vdgs.distributed.scheduler import MAX_NODE_REJECTIONS
 from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError
 from vdgs.distributed.slurm_executor import SlurmExecutor, make_batch_script
 from vdgs.distributed.slurm_job import SlurmTaskRecord
@@ -85,6 +87,7 @@ def run(folder: Path, count: int, said: list[str]) -> list[TaskResult]:
 
 
 BUSY = "Batch job submission failed: Socket timed out on send/recv operation"
+TOO_LARGE = "Batch job submission failed: Requested node configuration is not available"
 
 
 @pytest.mark.parametrize("was_taken", [False, True])
@@ -106,12 +109,12 @@ def test_a_busy_controller_is_asked_again_and_the_other_blocks_go_on(tmp_path, m
 
 
 def test_what_slurm_never_takes_fails_alone_and_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr(slurm_executor, "MAX_FAILED_POLLS", 3)
-    slurm = Controller(monkeypatch, [None, *["Requested node configuration is not available"] * 20], {})
+    slurm = Controller(monkeypatch, [None, *[TOO_LARGE] * 20], {})
     slurm.at = {3: lambda: slurm.end(1, 0, code=-11), 30: lambda: slurm.end(1, 1, code=0)}
     first, second = run(tmp_path, 2, [])
     assert (first.state, second.state) == ("failed", "done")
-    assert "SLURM, which does not take it (sbatch: error: Requested node" in first.reason
+    assert first.reason.startswith(f"SLURM does not take it (sbatch: error: {TOO_LARGE}; the script: {tmp_path}")
+    assert len(slurm.scripts) == 2  # it is not asked again and again
     with pytest.raises(VdgsError, match="does not take the jobs"):  # nothing is at work that could be lost
         run(tmp_path, 1, [])
 
@@ -156,6 +159,63 @@ def test_a_node_that_slurm_gives_again_all_the_same_costs_attempts(tmp_path, mon
     (result,) = run(tmp_path, 1, [])
     assert result.state == "failed"
     assert "crashed 2 times, at last by a node that cannot work on the run, n1: an old vdgs" in result.reason
+
+
+def test_a_block_fails_at_once_where_no_node_is_left_and_names_what_the_last_one_lacks(tmp_path, monkeypatch):
+    slurm = Controller(monkeypatch, [None, None, *[TOO_LARGE] * 20], {})
+    slurm.at = {
+        3: lambda: slurm.end(1, 0, code=1, unfit="an old vdgs"),
+        6: lambda: slurm.end(2, 0, code=1, unfit="there is no /data", node="n2"),
+    }
+    (result,) = run(tmp_path, 1, [])
+    assert result.state == "failed"
+    assert "2 nodes that cannot work on the run, at last n2: there is no /data (sbatch: error" in result.reason
+    assert len(slurm.scripts) == 3
+    assert slurm.polls < 9
+
+
+def test_not_every_node_of_a_large_cluster_is_tried(tmp_path, monkeypatch):
+    slurm = Controller(monkeypatch, [], {})
+
+    def unfit(turn: int) -> None:
+        slurm.end(turn, 0, code=1, unfit="there is no /data", node=f"n{turn}")
+
+    slurm.at = {3 * turn: partial(unfit, turn) for turn in range(1, 100)}
+    (result,) = run(tmp_path, 1, [])
+    assert result.state == "failed"
+    assert len(slurm.scripts) == MAX_NODE_REJECTIONS + 2  # and the attempts that it has
+    assert f"n{MAX_NODE_REJECTIONS + 2}: there is no /data" in result.reason
+
+
+@pytest.mark.parametrize(
+    ("said", "is_busy"),
+    [
+        (BUSY, True), ("Unable to contact slurm controller (connect failure)", True),
+        ("Batch job submission failed: Zero Bytes were transmitted or received", True),
+        ("Slurm temporarily unable to accept job, sleeping and retrying", True), (TOO_LARGE, False),
+        ("Batch job submission failed: Invalid account or account/partition combination specified", False),
+        ("Memory specification can not be satisfied", False),
+    ],
+)  # fmt: skip
+def test_a_controller_that_does_not_answer_is_told_from_one_that_refuses(said, is_busy):
+    assert SlurmError(f"sbatch: error: {said}").is_busy is is_busy
+
+
+def test_a_controller_that_stays_silent_costs_attempts(tmp_path, monkeypatch):
+    monkeypatch.setattr(slurm_executor, "MAX_FAILED_POLLS", 3)
+    slurm = Controller(monkeypatch, [None, *[BUSY] * 20], {})
+    slurm.at = {3: lambda: slurm.end(1, 0, code=-11)}
+    (result,) = run(tmp_path, 1, [])
+    assert result.reason.startswith(f"crashed 2 times, at last by SLURM, which does not answer (sbatch: error: {BUSY}")
+
+
+def test_what_slurm_never_took_is_not_cancelled_there(tmp_path, monkeypatch):
+    slurm = Controller(monkeypatch, [], {})
+    engine = slurm_executor._SlurmEngine(NodeRequirements(tmp_path, []), SlurmOptions(), 1)
+    attempt = slurm_executor._SlurmAttempt(ArrayTaskId("", 0), tmp_path, engine)
+    attempt.kill()
+    assert attempt.poll() == AttemptResult(EXIT_STOPPED)
+    assert not slurm.signals
 
 
 def test_nodes_that_a_person_avoids_are_avoided_too(tmp_path):

@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from support.flown_models import flown_model, sightings
+from vdgs.captures.position_adjustment import Up
+from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.geometry.similarity import Similarity
 from vdgs.sfm import georeferencing, georegistration
-from vdgs.sfm.bending import bend_to_positions
+from vdgs.sfm.bending import bend_to_positions, tell_level
 from vdgs.sfm.gcp_list import GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georeferencing import Georeferenced, georeference
+from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.scale_bars import ScaleBars, known_scale
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -78,6 +81,34 @@ def test_positions_along_one_line_bend_a_model_but_turn_it_not_about_the_line(se
     found = georeferenced(model, photographs, priors(places + rng.normal(0, 0.02, places.shape), 0.02, True), None)
     assert bent == [True]
     assert tilt_deg(found.model, photographs) < min(2.5, found.placed.accuracy.level_deg)
+
+
+@pytest.mark.parametrize("deviations", [(0.02, 0.03), (0.03, 0.02)])
+@pytest.mark.parametrize(
+    ("strips", "apart_m", "tells"), [(6, 30.0, True), (2, 10.0, True), (2, 0.3, False), (1, 0.0, False)]
+)
+def test_whether_positions_tell_level_is_no_matter_of_noise(deviations, strips, apart_m, tells):
+    """Strips metres apart do by RTK, whichever of across and up it measures better, whatever deviations are found
+    of it; strips within decimetres, which say no more than views do (2.5 degrees), do not."""
+    places = np.array([[20.0 * k, apart_m * strip, 80] for strip in range(strips) for k in range(10)])
+    (across, high), none = deviations, np.zeros(0)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        east, north, up = rng.uniform(0.8, 1.2, 3) * (across, across, high)
+        accuracy = AccuracyFacts(
+            place_m=None,
+            scale_percent=None,
+            scale_m=None,
+            north_deg=None,
+            level_deg=None,
+            positions_m=(east, north, up),
+        )
+        placed = Georegistration(
+            similarity=Similarity(1.0, np.eye(3), np.zeros(3)), method="", position_rows=none, residuals=none,
+            targets=places + rng.normal(0, (across, across, high), places.shape), inliers=np.ones(len(places), bool),
+            accuracy=accuracy,
+        )  # fmt: skip
+        assert tell_level(placed, Up(np.array([0.0, 0, 1]), 2.5, "the views")) is tells
 
 
 def test_a_known_distance_stays_as_long_as_it_is_where_positions_bend_the_model(bent):

@@ -245,14 +245,16 @@ def test_a_road_and_another_site_are_no_strays_but_a_place_where_a_receiver_stuc
     one = replace(photograph(tmp_path, 0), altitude=500.0)
     block = np.array([[30.0 * (k % 10), 30.0 * (k // 10), 0] for k in range(100)])
     road = np.array([[300 + 80.0 * k, 0, 0] for k in range(75)])
-    for more, used in (
-        (road, 175),
-        (block[:40] + np.array([5000, 0, 0]), 140),
-        (np.full((12, 3), [5000.0, 0, 0]), 100),
+    for more, used, apart in (
+        (road, 175, []),
+        (block[:40] + np.array([5000, 0, 0]), 140, ["the 140 positions lie in 2 places, 5.28 km across (100 in the"]),
+        (np.full((12, 3), [5000.0, 0, 0]), 100, []),
     ):
         places = geodetic_from_enu(np.concatenate([block, more]), ORIGIN)
         seen = [replace(one, name=f"{k:03}.jpg", lat_lon=tuple(place[:2])) for k, place in enumerate(places)]
-        assert len(positions_of(seen)) == used
+        found = positions_of(seen)
+        assert len(found) == used
+        assert [note.partition(" largest")[0] for note in found.notes if "places" in note] == apart
 
 
 def test_positions_at_one_place_say_nothing(tmp_path):
@@ -477,6 +479,13 @@ def strips(count: int, each: int) -> np.ndarray:
         pytest.param(strips(2, 20), 0.5, True, id="there and back"),
         pytest.param(strips(3, 3), 0.5, True, id="nine photographs"),
         pytest.param(strips(5, 8) + np.outer(np.arange(40) // 20, [0, 0, 48]), 1.0, True, id="another datum"),
+        pytest.param(
+            np.vstack([strips(5, 8), circle(9.0) + np.array([3e4, 0, 79])]), 1.0, True, id="a survey and another site"
+        ),
+        pytest.param(
+            np.vstack([circle(30.0), strips(2, 8) + np.array([3e4, 0, 0])]), 0.5, False, id="a house and another site"
+        ),
+        pytest.param(strips(5, 8) * [400, 400, 40], 1.0, True, id="from high up, kilometres from one to the next"),
         pytest.param(strips(1, 20), 0.5, False, id="a line"),
         pytest.param(circle(30.0), 0.5, False, id="around a house"),
         pytest.param(circle(30.0) * [1, 0.3, 1], 0.5, False, id="around a long house"),

@@ -21,10 +21,17 @@ import numpy as np
 from PIL import Image, features
 
 from vdgs.captures.color_profiles import foreign_space, to_srgb
+from vdgs.captures.image_suffixes import (
+    AVIF_SUFFIXES,
+    HEIF_SUFFIXES,
+    IMAGE_SUFFIXES,
+    OTHER_IMAGE_SUFFIXES,
+    RAW_SUFFIXES,
+)
 from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end, with_end
 from vdgs.captures.name_resolution import find_file
 from vdgs.captures.optional_decoders import has_decoder, prepare_heif
-from vdgs.captures.raw_files import RAW_SUFFIXES, develop, is_raw, raw_size
+from vdgs.captures.raw_files import develop, is_raw, raw_size
 from vdgs.captures.strays import is_hidden
 from vdgs.captures.tiff_orientation import stored_size, without_orientation
 from vdgs.captures.xmp_packets import exif_of
@@ -38,15 +45,6 @@ python_warnings.filterwarnings("ignore", module=r"PIL\.")
 if "OPENCV_LOG_LEVEL" not in os.environ:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
-#: Photographs that a decoder of the extra `photos` reads, besides `RAW_SUFFIXES`, and those that Pillow may be built
-#: with.
-HEIF_SUFFIXES, AVIF_SUFFIXES = {".heic", ".heif", ".hif"}, {".avif"}
-JPEG_SUFFIXES = {".jfif", ".jpe", ".jif", ".mpo"}
-VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".mts", ".m2ts", ".m4v", ".insv", ".360", ".wmv"}
-OTHER_SUFFIXES = {".jxl", ".jp2", ".j2k", ".gif", ".psd", ".exr", ".hdr", ".tga", ".rjpeg", ".insp"}
-#: Photographs of which only some installations read all, or none do.
-OTHER_IMAGE_SUFFIXES = HEIF_SUFFIXES | AVIF_SUFFIXES | RAW_SUFFIXES | JPEG_SUFFIXES | OTHER_SUFFIXES
 #: Maker and model of a camera in EXIF.
 _CAMERA_TAGS, _ORIENTATION = {0x010F, 0x0110}, 0x0112
 #: Headers that announce more pixels than this are refused rather than decoded.

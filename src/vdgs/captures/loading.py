@@ -16,8 +16,9 @@ from vdgs.captures.formats.source_capture import SourceCapture
 from vdgs.captures.formats.transforms import is_transforms
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
 from vdgs.captures.image_checks import detect_rounding
-from vdgs.captures.image_files import MIN_SIDE_PX, VIDEO_SUFFIXES
+from vdgs.captures.image_files import MIN_SIDE_PX
 from vdgs.captures.image_matching import MatchedView, match_images
+from vdgs.captures.image_suffixes import VIDEO_SUFFIXES
 from vdgs.captures.nested_captures import check_no_foreign_file
 from vdgs.captures.off_path import match_off_path
 from vdgs.captures.output_guard import check_not_among_files

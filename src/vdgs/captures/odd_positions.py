@@ -36,21 +36,41 @@ def are_far_off(geodetic: np.ndarray, known: np.ndarray) -> np.ndarray:
         far = known & (across > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(across[known]))))
         high = up > max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * float(np.median(up[known])))
     if far.any():
-        groups = _groups(enu[known, :2])
-        far[known] &= [not _is_flown(enu[known, :2][groups == group]) for group in groups]
+        places = enu[known, :2]
+        far[known] &= ~_are_flown(places, _groups(places, OUTLIER_DISTANCE_M))
     return far | high
 
 
-def _is_flown(places: np.ndarray) -> bool:
-    return len(places) >= LEAST_GROUP and bool(np.ptp(places, axis=0).max() >= MIN_SPREAD_M)
+def places_apart(enu: np.ndarray) -> np.ndarray:
+    """For each position [n, 2 or more] in metres the number of the place that it lies at, that of most positions first:
+    between places are many times the distances from one position to the next."""
+    places = enu[:, :2]
+    if len(places) < 2 or np.ptp(places, axis=0).max() <= OUTLIER_DISTANCE_M:
+        return np.zeros(len(places), int)
+    from scipy.spatial import cKDTree
+
+    step = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    groups = _groups(places, max(OUTLIER_DISTANCE_M, OUTLIER_FACTOR * step))
+    rank = np.argsort(np.argsort(-np.bincount(groups), kind="stable"))
+    return np.asarray(rank[groups])
 
 
-def _groups(places: np.ndarray) -> np.ndarray:
-    """A number for each place [n, 2] of those that lie in squares beside each other, as wide as strays are far."""
+def _are_flown(places: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Which places [n, 2] are many in their groups [n], and not all one, [n] bool."""
+    counts = np.bincount(groups)
+    least, most = np.full((len(counts), 2), np.inf), np.full((len(counts), 2), -np.inf)
+    np.minimum.at(least, groups, places)
+    np.maximum.at(most, groups, places)
+    flown = (counts >= LEAST_GROUP) & ((most - least).max(axis=1) >= MIN_SPREAD_M)
+    return np.asarray(flown[groups])
+
+
+def _groups(places: np.ndarray, width_m: float) -> np.ndarray:
+    """A number for each place [n, 2] of those that lie in squares beside each other, so many metres wide."""
     from scipy.sparse.csgraph import connected_components  # slow to load, and few captures have strays
     from scipy.spatial import cKDTree
 
-    squares, number = np.unique(np.floor(places / OUTLIER_DISTANCE_M), axis=0, return_inverse=True)
+    squares, number = np.unique(np.floor(places / width_m), axis=0, return_inverse=True)
     tree = cKDTree(squares)
     beside = tree.sparse_distance_matrix(tree, 1.0, p=np.inf)
     return np.asarray(connected_components(beside)[1][number.ravel()])

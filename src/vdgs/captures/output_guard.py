@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING
 from vdgs.captures.formats.colmap import find_models
 from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
-from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, has_camera
+from vdgs.captures.image_files import has_camera
+from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from vdgs.captures.project_formats import is_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import is_result, is_run, why_not_read

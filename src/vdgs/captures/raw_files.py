@@ -15,14 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from vdgs.captures.image_suffixes import RAW_SUFFIXES
 from vdgs.captures.optional_decoders import require_decoder
 from vdgs.errors import CaptureError
 from vdgs.system.permissions import refusal
 
-#: Suffixes of raw files. What is a JPEG inside is none.
-RAW_SUFFIXES = {
-    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq",
-}  # fmt: skip
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\0", b"MM\0*")
 _XMP_TAG = 0x02BC

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from vdgs.captures.column_headings import LENGTHS, QUANTITIES, Heading, read_heading
-from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
+from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 
 #: What each column is called, once blanks, signs, accents, units and the case of letters are taken away.
 _COLUMNS: dict[str, frozenset[str]] = {

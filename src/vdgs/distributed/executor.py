@@ -168,6 +168,8 @@ class AttemptResult:
     """It was asked to save because its time was up or its place was needed, and did."""
     node_rejected: bool = False
     """It met a node that cannot work on the run, of which nobody knew; the next attempt avoids it."""
+    refused: bool = False
+    """The cluster does not take it, and would not take another attempt."""
 
 
 class Attempt(Protocol):

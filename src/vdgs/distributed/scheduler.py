@@ -34,6 +34,8 @@ from vdgs.system.units import data_size
 GRACE_SECONDS, GRACE_POLL_SECONDS = 120.0, 0.05
 #: What a task asks for after it was ended for want of memory, times what it asked for before (choice).
 MEMORY_RETRY_FACTOR = 1.5
+#: So many nodes that cannot work on the run cost a task no attempt: where most cannot, the others are not searched for.
+MAX_NODE_REJECTIONS = 8
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,8 @@ class _TaskState:
         self.locked_since: float | None = None
         #: How many iterations it had when its time was last up.
         self.progress = -1
+        #: How many nodes could not work on the run.
+        self.rejections = 0
 
     def request_stop(self) -> None:
         if self.attempt is not None and not self.stop_requested:
@@ -231,8 +235,10 @@ class _TaskScheduler:
         elif self._stopping:
             reason = f"ended by {_end_text(end)}; continues from its last checkpoint"
             self._end(state, "stopped", reason, was_killed=True)
-        elif end.node_rejected:  # no attempt of its own; as many as there are nodes
-            state.attempts -= 1
+        elif end.refused:
+            self._end(state, "failed", _end_text(end))
+        elif end.node_rejected and state.rejections < MAX_NODE_REJECTIONS:  # no attempt of its own
+            state.attempts, state.rejections = state.attempts - 1, state.rejections + 1
             self._listener.on_crashed(state.task, _end_text(end), self._policy.retries + 1 - state.attempts)
             self._waiting.append(state)
         else:

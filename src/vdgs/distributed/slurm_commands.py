@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,12 @@ SLURM_COMMANDS = ("sbatch", "squeue", "scancel", "scontrol")
 COMMAND_TIMEOUT_SECONDS = 120.0
 #: States of squeue in which a job has a place. SUSPENDED keeps it.
 RUNNING_STATES = ("RUNNING", "SUSPENDED", "COMPLETING", "STAGE_OUT", "SIGNALING")
+#: What SLURM's commands say where the controller is busy, starts again or is not reached, and may answer later.
+_BUSY = re.compile(
+    r"timed out|unable to contact|connect(ion)? (failure|refused|reset|error)|communication|zero bytes|standby"
+    r"|transport endpoint|no route to host|unreachable|temporarily",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,11 @@ class JobState:
 
 class SlurmError(VdgsError):
     """SLURM refused, or does not answer."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it did not answer; what it refused it would refuse again."""
+        return _BUSY.search(str(self)) is not None
 
 
 def require_slurm() -> None:

@@ -40,7 +40,7 @@ from vdgs.system.quoting import sbatch_directive, shell_line, slurm_file_pattern
 #: How often a job that squeue no longer lists is looked for in vain before it counts as lost: shared file systems show
 #: a file some seconds after it was written.
 MAX_MISSED_POLLS = 6
-#: How often in a row SLURM may give no answer, or take no further jobs: a controller is started again in some minutes.
+#: How often in a row SLURM may give no answer: a controller is started again in some minutes.
 MAX_FAILED_POLLS = 60
 #: SLURM's states of ended jobs, in words.
 END_REASONS = {
@@ -71,7 +71,7 @@ class SlurmExecutor(ExecutionPolicy):
 
 @dataclass
 class _Submission:
-    """An array of jobs, and how often SLURM did not take it."""
+    """An array of jobs, and how often SLURM did not answer whether it takes it."""
 
     folder: Path
     attempts: list[_SlurmAttempt]
@@ -91,9 +91,9 @@ class _SlurmEngine:
         self._folder = requirements.folder / "slurm"
         self._prefix = f"vdgs-{hashlib.sha256(str(requirements.folder).encode()).hexdigest()[:10]}-"
         self._failed_polls = 0
-        #: Nodes that cannot work on the run; what SLURM did not take yet.
-        self.rejected_nodes = set[str]()
-        self._refused = list[_Submission]()
+        #: Nodes that cannot work on the run, and why; what SLURM did not take yet.
+        self.rejected_nodes = dict[str, str]()
+        self._unanswered = list[_Submission]()
         self._has_submitted = False
         #: The jobs that squeue lists, by their numbers; those that an earlier driver submitted.
         self.queue = self._list_queue()
@@ -125,7 +125,7 @@ class _SlurmEngine:
             if self._failed_polls > MAX_FAILED_POLLS:
                 raise
             return
-        for submission in list(self._refused):
+        for submission in list(self._unanswered):
             self._submit_again(submission)
 
     def _list_queue(self) -> dict[ArrayTaskId, QueueEntry]:
@@ -155,12 +155,12 @@ class _SlurmEngine:
         except SlurmError as error:
             if not (self._has_submitted or self.queue):
                 raise VdgsError(f"SLURM does not take the jobs: {error}\nThe script: {submission.script}") from error
-            self._refused.append(submission)  # others are at work, and SLURM may be busy
+            self._not_taken(submission, error)  # others are at work
         return {task.name: attempt for (task, _), attempt in zip(group, attempts, strict=True)}
 
     def _submit_again(self, submission: _Submission) -> None:
         """Submit what SLURM did not take, unless it did: a busy controller may take a job and answer too late."""
-        self._refused.remove(submission)
+        self._unanswered.remove(submission)
         if all(attempt.has_ended for attempt in submission.attempts):
             return
         name = submission.folder.name
@@ -169,11 +169,28 @@ class _SlurmEngine:
             self._list(submission, taken or slurm_commands.submit(submission.script))
         except SlurmError as error:
             submission.failures += 1
-            if submission.failures < MAX_FAILED_POLLS:
-                self._refused.append(submission)
-                return
-            for attempt in submission.attempts:
-                attempt.give_up(f"SLURM, which does not take it ({error}; the script: {submission.script})")
+            self._not_taken(submission, error)
+
+    def _not_taken(self, submission: _Submission, error: SlurmError) -> None:
+        """Ask again later where SLURM was busy; fail at once what it refused: with the nodes that it was to avoid, or
+        with more than it has, it would refuse that again."""
+        if error.is_busy and submission.failures < MAX_FAILED_POLLS:
+            self._unanswered.append(submission)
+            return
+        said = f"({error}; the script: {submission.script})"
+        for attempt in submission.attempts:
+            attempt.give_up(*self._reason_of_refusal(attempt, error, said))
+
+    def _reason_of_refusal(self, attempt: _SlurmAttempt, error: SlurmError, said: str) -> tuple[str, bool]:
+        """Why a job was not taken, and whether another attempt is in vain."""
+        if error.is_busy:
+            return f"SLURM, which does not answer {said}", False
+        if not attempt.avoided:
+            return f"SLURM does not take it {said}", True
+        node = next(node for node in reversed(self.rejected_nodes) if node in attempt.avoided)
+        count = f"the {len(attempt.avoided)} nodes that cannot" if len(attempt.avoided) > 1 else "a node that cannot"
+        why = f"without {count} work on the run, at last {node}: {self.rejected_nodes[node]}"
+        return f"SLURM does not take it {why} {said}", True
 
     def _list(self, submission: _Submission, number: str) -> None:
         """Take the jobs of a submission for queued until squeue says otherwise."""
@@ -221,7 +238,7 @@ class _SlurmAttempt:
     """A job of an array; the number of its array is empty until SLURM takes it."""
 
     def __init__(self, task_id: ArrayTaskId, folder: Path, engine: _SlurmEngine, avoided: frozenset[str] = frozenset()):
-        self.task_id, self._folder, self._engine, self._avoided = task_id, folder, engine, avoided
+        self.task_id, self._folder, self._engine, self.avoided = task_id, folder, engine, avoided
         self._result: AttemptResult | None = None
         self._missed_polls = self._turn = 0
         self._is_cancelled = self._is_killed = False
@@ -231,9 +248,9 @@ class _SlurmAttempt:
     def has_ended(self) -> bool:
         return self._result is not None
 
-    def give_up(self, why: str) -> None:
-        """It is lost before it began."""
-        self._result = self._result or AttemptResult(None, why)
+    def give_up(self, why: str, refused: bool) -> None:
+        """It is lost before it began; where it was refused, so would be another."""
+        self._result = self._result or AttemptResult(None, why, refused=refused)
 
     def poll(self) -> AttemptResult | None:
         if self._result is None and self.task_id.array and self._engine.is_current:
@@ -263,7 +280,9 @@ class _SlurmAttempt:
             slurm_commands.signal_batch(self.task_id, "TERM")
 
     def kill(self) -> None:
-        if not self._is_killed:
+        if not self.task_id.array:
+            self.request_stop()
+        elif not self._is_killed:
             self._is_killed = True
             slurm_commands.cancel(self.task_id)
 
@@ -275,9 +294,9 @@ class _SlurmAttempt:
             self._missed_polls += 1
             return self._lost(record) if self._missed_polls > MAX_MISSED_POLLS else None
         if record.unfit:
-            self._engine.rejected_nodes.add(record.node)
+            self._engine.rejected_nodes[record.node] = record.unfit
             reason = f"a node that cannot work on the run, {record.node}: {record.unfit}"
-            return AttemptResult(None, reason, node_rejected=record.node not in self._avoided)
+            return AttemptResult(None, reason, node_rejected=record.node not in self.avoided)
         if self.start_info is None:
             self.start_info = AttemptStarted(record.output_from, record.node)
         # One that put itself back into the queue may be cancelled there.

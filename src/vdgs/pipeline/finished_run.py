@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from vdgs.captures.capture_root import capture_root
+from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
+from vdgs.captures.strays import is_run
 from vdgs.config.commands import RunRequest
 from vdgs.errors import VdgsError
 from vdgs.evaluation.measured_as import is_evaluated
@@ -16,6 +18,9 @@ from vdgs.report.status_cli import full_run_status, next_line
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import with_absolute_paths
 from vdgs.system.atomic_files import read_json_or_empty
+
+#: What photographs and masks are called.
+PICTURE_SUFFIXES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
 
 
 def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ()) -> str:
@@ -59,26 +64,36 @@ def _is_whole(run: RunFolder, request: RunRequest) -> bool:
 
 
 def _input_times(request: RunRequest, files: Sequence[Path]) -> Iterator[int]:
-    """When the files and folders that a command names changed last."""
+    """When the files and folders that a command names changed last, but for the runs among them."""
     options = with_absolute_paths(request.options, request.capture)
     outside = [Path(each) for each in (options.images, options.masks) if each and Path(each).is_absolute()]
     named = [each for each in vars(options).values() if isinstance(each, Path)]
     for path in (request.capture, *request.extra_image_folders, *named, *outside, *files):
-        yield from _times(path)
+        yield from _times(path, request.output)
 
 
 def _photograph_times(run: RunFolder) -> Iterator[int]:
-    """When the folders that hold photographs or masks of the capture changed last, and the files in them: those of a
-    project may lie anywhere."""
+    """When the photographs and masks of the capture changed last, which of a project may lie anywhere, and the folders
+    that they are in."""
     root = capture_root(Path(run.settings().capture_path))
     for folder in read_json_or_empty(run.cameras_file).get("input_folders", ()):
-        yield os.stat(root / folder).st_mtime_ns
-        yield from (os.stat(entry.path).st_mtime_ns for entry in os.scandir(root / folder))
+        yield from _own_time(root / folder, run.path)
+        pictures = [each for each in os.scandir(root / folder) if Path(each.name).suffix.lower() in PICTURE_SUFFIXES]
+        yield from (os.stat(each.path).st_mtime_ns for each in pictures if not each.is_dir())
 
 
-def _times(path: Path) -> Iterator[int]:
-    """When a file changed last; of a folder, also of everything in the folder, also by links to other folders."""
-    yield path.stat().st_mtime_ns
+def _own_time(folder: str | Path, output: Path) -> Iterator[int]:
+    """When something in a folder was added, removed or renamed last; none of a folder around the run, where runs and
+    what is written beside them come and go."""
+    if not Path(os.path.realpath(output)).is_relative_to(os.path.realpath(folder)):
+        yield os.stat(folder).st_mtime_ns
+
+
+def _times(path: Path, output: Path) -> Iterator[int]:
+    """When a file changed last; of a folder, also of everything in the folder, also by links to other folders, but for
+    runs."""
+    if not path.is_dir():
+        yield path.stat().st_mtime_ns
     seen = set[tuple[int, int]]()  # a link may lead to a folder around it
     for folder, inner, names in os.walk(path, followlinks=True):
         status = os.stat(folder)
@@ -86,5 +101,6 @@ def _times(path: Path) -> Iterator[int]:
             inner.clear()
             continue
         seen.add((status.st_dev, status.st_ino))
-        yield status.st_mtime_ns
+        inner[:] = [name for name in inner if not is_run(Path(folder, name))]
+        yield from _own_time(folder, output)
         yield from (os.stat(os.path.join(folder, name)).st_mtime_ns for name in names)

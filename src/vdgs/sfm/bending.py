@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from vdgs.captures.position_adjustment import Up
 from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm.gcp_list import GcpObservation
 from vdgs.sfm.georegistration import Georegistration, model_points, transform_model
@@ -19,6 +20,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 MOST_BENT = 0.1
 #: Positions tell how a model is bent where they are good to this share of the flying height (choice), and so many.
 GOOD_SHARE, ENOUGH_POSITIONS = 0.01, 6
+#: Of two deviations the smaller is plainly better below this share of the larger (choice).
+PLAINLY_BETTER = 0.5
 #: Points that an image counts with: its center and one along each of its axes.
 TRIAD = 4
 
@@ -67,15 +70,15 @@ def bend_to_positions(
     return bent
 
 
-def tell_level(placed: Georegistration) -> bool:
-    """Whether positions alone tell level as well as it is known by all: not along a line that is straight to what they
-    are wrong by."""
+def tell_level(placed: Georegistration, up: Up) -> bool:
+    """Whether positions alone tell level plainly better than attitudes or views do: not along a line that is straight
+    to what they are wrong by, nor where both are about as good."""
     accuracy = placed.accuracy
-    if accuracy is None or accuracy.positions_m is None or accuracy.level_deg is None:
+    if accuracy is None or accuracy.positions_m is None:
         return False
     used = placed.targets[placed.inliers]
     across = float(np.linalg.svd(used - used.mean(axis=0), compute_uv=False)[1])
-    return 2 * np.degrees(np.arctan2(max(accuracy.positions_m), across)) <= accuracy.level_deg
+    return bool(np.degrees(np.arctan2(max(accuracy.positions_m), across)) <= PLAINLY_BETTER * up.deviation_deg)
 
 
 def bend_to_points(

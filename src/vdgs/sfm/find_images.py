@@ -8,19 +8,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vdgs.captures.image_files import (
+from vdgs.captures.image_files import readable_images, readable_suffixes
+from vdgs.captures.image_suffixes import (
     AVIF_SUFFIXES,
     HEIF_SUFFIXES,
     IMAGE_SUFFIXES,
     JPEG_SUFFIXES,
     OTHER_IMAGE_SUFFIXES,
+    RAW_SUFFIXES,
     VIDEO_SUFFIXES,
-    readable_images,
-    readable_suffixes,
 )
 from vdgs.captures.name_resolution import to_colmap_name, to_nfc
 from vdgs.captures.optional_decoders import INSTALL
-from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.strays import is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import check_is_text

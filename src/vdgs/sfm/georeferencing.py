@@ -165,12 +165,13 @@ def _bent(
     model: pycolmap.Reconstruction, placed: Georegistration, prepared: ReconstructionPlan, hold_focal: bool
 ) -> tuple[pycolmap.Reconstruction, Georegistration]:
     """The model bent by positions that are good for that, and how far they are from it then. What is bent fits them
-    better: how large, how level and where it is comes anew of all that is known, if they do not leave level open."""
+    better: how large, how level and where it is comes anew of all that is known, if they plainly tell level."""
     photographs, positions = prepared.image_list.images, prepared.gps_priors
     bent = bend_to_positions(model, photographs, positions, placed, hold_focal, prepared.threads)
     if bent is model:
         return model, placed
-    anew = _by_positions(bent, prepared) if tell_level(placed) else None
+    up, _ = georegistration.up_of(model, photographs)
+    anew = _by_positions(bent, prepared) if tell_level(placed, up) else None
     if isinstance(anew, Georegistration) and anew.is_georeferenced:
         georegistration.transform_model(bent, anew.similarity)
     lies = georegistration.registration_in_place(bent, photographs, positions, placed.method)

@@ -11,7 +11,7 @@ import numpy as np
 from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_altitudes import refuse_unit, with_altitudes, without_zero_altitudes, wrong_unit
 from vdgs.captures.gps_tables import GpsRow, read_gps_table
-from vdgs.captures.odd_positions import MIN_SPREAD_M, are_far_off, are_nowhere, do_not_spread
+from vdgs.captures.odd_positions import MIN_SPREAD_M, are_far_off, are_nowhere, do_not_spread, places_apart
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
 from vdgs.sfm.flights import STEP_M, flights_of
@@ -124,6 +124,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
             f"north; not used.{' Are they in radians? Write degrees.' if radians else ''}"
         )
         index, enu = index[:0], enu[:0]
+    notes += _of_places_apart(enu)
     deviations = np.array(
         [_position_std(photographs[i], recorded.rows.get(i), table, std_m) for i in index.tolist()]
     ).reshape(-1, 3)
@@ -152,6 +153,18 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         altitude_step_m=step,
         datum_errors_m=np.array([photo.datum_error_m if table is None else recorded.datum_error_m for photo in taken]),
     )
+
+
+def _of_places_apart(enu: np.ndarray) -> list[str]:
+    """What to say of positions [n, 3] that do not lie at one place."""
+    counts = np.bincount(places_apart(enu))
+    if len(counts) < 2:
+        return []
+    km = float(np.linalg.norm(np.ptp(enu[:, :2], axis=0))) / 1000
+    return [
+        f"the {len(enu)} positions lie in {len(counts)} places, {km:,.3g} km across ({counts[0]} in the largest, "
+        "which tells what kind of flight it was). If they are several scenes, reconstruct each by itself."
+    ]
 
 
 def _altitude_step(altitudes: np.ndarray) -> float:

@@ -9,11 +9,10 @@ from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.image_files import HEIF_SUFFIXES, IMAGE_SUFFIXES
+from vdgs.captures.image_suffixes import HEIF_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
 from vdgs.captures.name_resolution import jpeg_name, match_key
 from vdgs.captures.nested_captures import check_no_foreign_file, foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
-from vdgs.captures.raw_files import RAW_SUFFIXES
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk
 from vdgs.config.sfm_options import Brackets, CameraModel

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
+from vdgs.captures.odd_positions import places_apart
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.capture_writer import placed_images
@@ -19,7 +20,7 @@ from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
 from vdgs.sfm.georegistration import is_nearly_collinear
-from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, FISHEYE, ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
@@ -150,14 +151,16 @@ def height_over_points(image: pycolmap.Image, model: pycolmap.Reconstruction) ->
 
 def _is_survey_grid(positions: GpsPriors, errors: float = 0.0) -> bool:
     """Whether photographs were taken from one height (but for so many metres of errors) all over an area, as a survey
-    is, and not around something."""
-    if not positions.usable or not positions.has_altitudes or is_nearly_collinear(positions.enu, positions.gps_std):
+    is, and not around something. Of places apart that with most photographs tells."""
+    here = places_apart(positions.enu) == 0
+    enu = positions.enu[here]
+    if len(enu) < MIN_POSITIONS or not positions.has_altitudes or is_nearly_collinear(enu, positions.gps_std[here]):
         return False
-    plane = positions.enu[:, :2] - positions.enu[:, :2].mean(axis=0)
+    plane = enu[:, :2] - enu[:, :2].mean(axis=0)
     axes, spread, _ = np.linalg.svd(plane, full_matrices=False)
     spread, alike = spread / np.sqrt(len(plane)), np.linalg.norm(axes, axis=1) * np.sqrt(len(plane))
     around = np.quantile(alike, 0.1) > ORBIT_RADIUS_SHARE * np.sqrt(2)
-    heights, moments = positions.enu[:, 2], np.arange(len(positions))
+    heights, moments = enu[:, 2], np.flatnonzero(here)
     steady = heights - np.polyval(np.polyfit(moments, heights, 1), moments)  # altitudes of receivers drift
     return not around and min(_range(heights), _range(steady)) <= np.hypot(errors, MIN_HEIGHT_SPREAD * spread[1])
 

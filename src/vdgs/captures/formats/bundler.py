@@ -14,7 +14,7 @@ import numpy as np
 from vdgs.captures.formats.photograph_sizes import check_seen_inside, name_unaligned, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
-from vdgs.captures.image_files import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
+from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
