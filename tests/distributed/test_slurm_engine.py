@@ -193,6 +193,7 @@ def test_not_every_node_of_a_large_cluster_is_tried(tmp_path, monkeypatch):
         (BUSY, True), ("Unable to contact slurm controller (connect failure)", True),
         ("Batch job submission failed: Zero Bytes were transmitted or received", True),
         ("Slurm temporarily unable to accept job, sleeping and retrying", True), (TOO_LARGE, False),
+        ("QOSMaxSubmitJobPerUserLimit", True), ("QOSMaxMemoryPerUser", False),
         ("Batch job submission failed: Invalid account or account/partition combination specified", False),
         ("Memory specification can not be satisfied", False),
     ],

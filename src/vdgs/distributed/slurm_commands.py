@@ -18,10 +18,11 @@ SLURM_COMMANDS = ("sbatch", "squeue", "scancel", "scontrol")
 COMMAND_TIMEOUT_SECONDS = 120.0
 #: States of squeue in which a job has a place. SUSPENDED keeps it.
 RUNNING_STATES = ("RUNNING", "SUSPENDED", "COMPLETING", "STAGE_OUT", "SIGNALING")
-#: What SLURM's commands say where the controller is busy, starts again or is not reached, and may answer later.
+#: What SLURM's commands say where the controller is busy, starts again or is not reached, and may answer later, and
+#: where a user has as many jobs as are allowed at a time.
 _BUSY = re.compile(
     r"timed out|unable to contact|connect(ion)? (failure|refused|reset|error)|communication|zero bytes|standby"
-    r"|transport endpoint|no route to host|unreachable|temporarily",
+    r"|transport endpoint|no route to host|unreachable|temporarily|MaxSubmitJob",
     re.IGNORECASE,
 )
 
