@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from support.block_training import BLOCKS, block_stage, coarse
 from support.decode_scenes import Scene, looking_down, turned
 from vdgs.config.method import BlockConfig, MethodConfig
+from vdgs.config.presets import PRESETS
 from vdgs.errors import RunError
 from vdgs.kernels import cpu, torch_ref
 from vdgs.model.anchor_model import AnchorModel
@@ -35,6 +36,8 @@ from vdgs.training.crops import (
     mean_crop_area,
     steps_for,
 )
+from vdgs.training.depth_agreement import is_agreement_due
+from vdgs.training.pseudo_views import is_pseudo_view_due
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
 ALL_OF = (0, 0, 64, 48)
@@ -153,6 +156,16 @@ def test_now_and_then_a_whole_photograph_is_drawn():
     assert drawn.count(FULL_IMAGE) == 5
     assert set(drawn) == {FULL_IMAGE, crops[1]}
     assert crop_at(None, 1, 0) == FULL_IMAGE
+
+
+@pytest.mark.parametrize("is_due", [is_agreement_due, is_pseudo_view_due])
+def test_whole_photographs_meet_the_losses_against_floaters(is_due):
+    """As often as parts of photographs do."""
+    laptop = PRESETS["laptop"].training
+    steps = range(laptop.iterations // 2, laptop.iterations // 2 + 400)
+    due = [step for step in steps if is_due(laptop, step)]
+    whole = [step for step in due if crop_at((Crop(0, 0, 0.5, 0.5),), 0, step) == FULL_IMAGE]
+    assert len(whole) == len(due) / FULL_IMAGE_EVERY > 0
 
 
 def test_few_pixels_make_more_steps_but_not_endlessly_many():

@@ -295,7 +295,7 @@ class BlockConfig:
     swa_fraction: Annotated[float, Range(0, 1, exclusive_max=True)] = 0.0
     """As in the coarse stage."""
     crop: Literal["off", "fixed-steps", "fixed-pixels"] = "off"
-    """Draw only the part of each photograph that shows the block, and all of it in every fourth step. `fixed-steps`:
+    """Draw only the part of each photograph that shows the block, and all of it in every fifth step. `fixed-steps`:
     each step costs less (experimental: no table has it); `fixed-pixels`: as many pixels are drawn as without, in up to
     four times more steps; `iterations` then counts whole photographs (choice)."""
     lr_scale_offsets: Annotated[float, FACTOR_RANGE] = 1.0
