@@ -31,8 +31,8 @@ TAIL_FRACTION = 0.005
 MARGIN = 0.04
 #: A part as large as this is the whole photograph: nothing would be saved.
 FULL_AREA_FRACTION = 0.9
-#: Every so many steps draw the whole photograph (choice): floaters outside the crops would otherwise remain. No multiple
-#: of the steps between two that compare depths or draw a pseudo view, so that whole photographs meet these too.
+#: Every so many steps draw the whole photograph (choice): floaters outside the crops would otherwise remain. It is no
+#: multiple of the steps between two that compare depths or draw a pseudo view: whole photographs meet these too.
 FULL_IMAGE_EVERY = 5
 #: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
 MAX_STEP_FACTOR = 4.0
