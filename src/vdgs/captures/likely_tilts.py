@@ -75,12 +75,17 @@ class Likely:
 
     def radius_deg(self, up: np.ndarray) -> float:
         """By how many degrees `up` is off at most (95 %)."""
-        return self.below_95(np.degrees(np.arctan2(np.linalg.norm(np.cross(self.ups, up), axis=1), self.ups @ up)))
+        off = np.degrees(np.arctan2(np.linalg.norm(np.cross(self.ups, up), axis=1), self.ups @ up))
+        return self._below(off, 0.95)
 
-    def below_95(self, values: np.ndarray) -> float:
-        """What values [m] of the directions stay below (95 %)."""
+    def farther_end(self, values: np.ndarray) -> float:
+        """How far the farther end of the middle 95 % of values [m] of the directions lies from 0. A level strip lies at
+        the end of all to one side."""
+        return max(abs(self._below(values, share)) for share in (0.025, 0.975))
+
+    def _below(self, values: np.ndarray, share: float) -> float:
         order = np.argsort(values)
-        place = int(np.searchsorted(np.cumsum(self.weights[order]), 0.95))
+        place = int(np.searchsorted(np.cumsum(self.weights[order]), share))
         return float(values[order[min(place, len(order) - 1)]])
 
 

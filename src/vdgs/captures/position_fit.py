@@ -138,5 +138,5 @@ def _moved_by_tilts(likely: Likely, moments: Moments, level: np.ndarray) -> tupl
     """By which share scale is off at most for up that is off, and by how many degrees north (95 %)."""
     moments, ups = moments.turned(level), likely.ups @ level.T
     factor = moments.fitted(ups)[0] / moments.fitted(np.array([[0.0, 0.0, 1.0]]))[0]
-    scale = likely.below_95(np.abs(np.log(np.maximum(np.abs(factor), 1e-300))))
-    return math.expm1(min(50.0, scale)), likely.below_95(np.abs(np.degrees(np.angle(factor))))
+    scale = likely.farther_end(np.log(np.maximum(np.abs(factor), 1e-300)))
+    return math.expm1(min(50.0, scale)), likely.farther_end(np.degrees(np.angle(factor)))
