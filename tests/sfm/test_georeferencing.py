@@ -211,7 +211,8 @@ def test_positions_without_altitudes_tell_scale_and_north(wrong_m, count):
 @pytest.mark.parametrize("altitudes", ["none", "useless"])
 @pytest.mark.parametrize(("count", "each"), [(2, 10), (6, 10)])
 def test_chance_in_the_plane_does_not_tilt_what_attitudes_or_views_level(altitudes, count, each):
-    """A tilt of 3 degrees shortens a flight by 0.1 %, as errors of positions do: level stays as it was known."""
+    """A tilt of 3 degrees shortens a flight by 0.1 %, as errors of positions do: level stays as it was known, or is
+    nearer where that was far off."""
     within = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -223,8 +224,9 @@ def test_chance_in_the_plane_does_not_tilt_what_attitudes_or_views_level(altitud
         known = float(np.degrees(np.arccos((turn @ problem.up.direction)[2])))
         fit = fit_positions(replace(problem, has_altitudes=altitudes != "none"))
         assert fit.altitude == ("none" if altitudes == "none" else "drifts")
-        assert tilt_deg(fit, turn) == pytest.approx(known, abs=0.1)
-        assert fit.level_error_deg >= 2.4 * 3.0
+        assert known - 2.0 < tilt_deg(fit, turn) < known + 0.1
+        assert known > 2 * 3.0 or tilt_deg(fit, turn) == pytest.approx(known, abs=0.1)
+        assert fit.level_error_deg >= tilt_deg(fit, turn)
         within.append(abs(fit.similarity.scale / SCALE - 1) <= fit.scale_error)
     assert np.mean(within) >= 0.8
 

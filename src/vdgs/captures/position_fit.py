@@ -15,14 +15,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vdgs.captures.gps_altitudes import are_over_ground
+from vdgs.captures.likely_tilts import Likely, Moments, likely_tilts
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, fit_plane, in_plane
-from vdgs.captures.position_adjustment import PositionFit, Problem, alike_factors, settle, tilt_of
+from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, alike_factors, settle
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
 
-#: Positions in the plane must explain the flight better by so much (log likelihood; choice) to tell up otherwise than
-#: attitudes or views do; up is then held to so many degrees. 95 % of errors in two directions lie within so many
-#: standard deviations of one.
-TILT_COSTS, HELD_DEG, BOTH_WITHIN = 8.0, 1e-3, 2.45
+#: Up is held to so many degrees. 95 % of errors in two directions lie within so many standard deviations of one.
+HELD_DEG, BOTH_WITHIN = 1e-3, 2.45
+#: Positions in the plane tell up where it would be off by so many times more without them (choice).
+TELL_BETTER = 1.2
 
 
 def fit_positions(problem: Problem) -> PositionFit:
@@ -86,68 +87,56 @@ def _extent(places: np.ndarray) -> float:
 
 
 def _settle_in_plane(problem: Problem) -> PositionFit:
-    """The fit without altitudes: up as it is known without positions, unless these plainly say otherwise.
+    """The fit without altitudes: up as it is known without positions, unless these tell it better.
 
-    Positions in the plane show a tilt by the flight that it shortens, by 1 - cos(tilt), which chance does to any flight
-    (0.1 % are 2.6 degrees), and which is the same for a tilt to the other side. Level is no better than it was known.
+    A flight in one plane shows a tilt by the share that it is shortened by, which chance does to any flight (0.1 % are
+    2.6 degrees), and shows it to either side alike: no fit with its least squares tells that. Up is weighed by all its
+    likely directions, and what they leave open of scale and north is part of the errors.
     """
-    up = problem.up
-    held = settle(replace(problem, up=replace(up, deviation_deg=HELD_DEG)), _upright_start(problem), "unused")
-    free = [settle(problem, start, "unused") for start in _tilted_starts(problem, held.inliers)]
-    best, other = sorted(free, key=lambda fit: fit.score)
-    known_deg = BOTH_WITHIN * up.deviation_deg
-    if _explains_more(best, held, problem):
-        apart_deg = _tilt_deg(other, best.similarity.rotation[2])
-        if apart_deg <= known_deg or _explains_more(best, other, problem):
-            return replace(best, level_error_deg=max(best.level_error_deg, known_deg))
-        known_deg = max(known_deg, _tilt_deg(best, up.direction))  # it is tilted, to whichever side
-    scale, north_deg = _moved_by_tilts(held, known_deg)
+    up, level = problem.up, rotation_to_z(problem.up.direction)
+    start = _upright_start(problem)
+    for _ in range(2):  # up along a slope explains positions as badly as any: the second starts at the likeliest
+        free = settle(problem, start, "unused")
+        moments = Moments.of((problem.centers @ level.T)[free.inliers], problem.targets[free.inliers])
+        likely = likely_tilts(moments, *_worth(free, problem), up.deviation_deg, problem.scale)
+        start = _upright_start(replace(problem, up=replace(up, direction=level.T @ likely.likeliest)))
+    chosen, level_deg = _chosen(likely, BOTH_WITHIN * up.deviation_deg)
+    held = replace(up, direction=level.T @ chosen, deviation_deg=HELD_DEG)
+    fit = settle(replace(problem, up=held), _upright_start(replace(problem, up=held)), "unused")
+    scale, north_deg = _moved_by_tilts(likely, moments, rotation_to_z(chosen))
+    moved_deg = float(np.degrees(np.arccos(min(1.0, chosen[2]))))
     return replace(
-        held,
-        level_error_deg=max(held.level_error_deg, known_deg),
-        scale_error=math.hypot(held.scale_error, min(scale, 2 * held.scale_error)),
-        north_error_deg=math.hypot(held.north_error_deg, min(north_deg, 2 * held.north_error_deg)),
+        fit,
+        level_error_deg=max(fit.level_error_deg, level_deg),
+        scale_error=math.hypot(fit.scale_error, scale),
+        north_error_deg=math.hypot(fit.north_error_deg, north_deg),
+        score=fit.score + 0.5 * (moved_deg / up.deviation_deg) ** 2,
     )
 
 
-def _tilt_deg(fit: PositionFit, up: np.ndarray) -> float:
-    return float(np.degrees(np.linalg.norm(tilt_of(fit.similarity.rotation @ up))))
+def _worth(fit: PositionFit, problem: Problem) -> tuple[float, float]:
+    """As how many independent positions those that are trusted count, where residuals follow each other alike; and by
+    how much positions are usually off, in metres."""
+    alike = float(alike_factors(fit.residuals[fit.inliers], problem.in_order(fit.inliers))[:2].max())
+    usual = USUAL_M[0] if problem.stated is None else float(np.median(problem.stated[:, :2]))
+    return int(fit.inliers.sum()) / alike**2, usual
 
 
-def _explains_more(one: PositionFit, other: PositionFit, problem: Problem) -> bool:
-    """Whether a fit plainly explains positions across better than another: residuals that follow each other alike count
-    as if there were fewer of them. Altitudes, which neither uses, are left out."""
-    alike = float(alike_factors(one.residuals[one.inliers], problem.in_order(one.inliers))[:2].max())
-    up = len(one.inliers) * float(np.log(other.gps_std[2] / one.gps_std[2]))
-    return other.score - one.score - up > TILT_COSTS * alike**2
+def _chosen(likely: Likely, known_deg: float) -> tuple[np.ndarray, float]:
+    """Up, where z is up as it is known without positions, and its error in degrees."""
+    told = np.array([0.0, 0.0, 1.0])
+    radius, best = min(
+        ((likely.radius_deg(up), up) for up in (likely.middle, likely.likeliest)),
+        key=lambda each: each[0],
+    )
+    if likely.radius_deg(told) <= TELL_BETTER * radius:
+        return told, max(known_deg, likely.radius_deg(told))
+    return best, radius
 
 
-def _tilted_starts(problem: Problem, inliers: np.ndarray) -> list[Similarity]:
-    """The two similarities, tilted to one side and to the other, that shorten a flight in one plane as positions do."""
-    centers, targets = problem.centers[inliers], problem.targets[inliers]
-    middle = centers.mean(axis=0)
-    along = np.linalg.svd(centers - middle, full_matrices=False)[2][:2]
-    flat = np.linalg.lstsq((centers - middle) @ along.T, (targets - targets.mean(axis=0))[:, :2], rcond=None)[0].T
-    left, sizes, right = np.linalg.svd(flat)
-    scale = max(float(sizes[0]), 1e-300)
-    cosine = min(1.0, float(sizes[1]) / scale)
-    across, sine, starts = right @ along, math.sqrt(1 - cosine**2), []
-    for side in (-sine, sine):
-        rows = left @ np.stack([across[0], cosine * across[1] + side * np.cross(*along)])
-        rotation = np.stack([*rows, np.cross(*rows)])
-        starts.append(Similarity(scale, rotation, targets.mean(axis=0) - scale * rotation @ middle))
-    return starts
-
-
-def _moved_by_tilts(held: PositionFit, tilt_deg: float) -> tuple[float, float]:
-    """By which share scale changes at most, and by how many degrees north, where up is tilted by so much to any side.
-    More than twice what is left open of them would show."""
-    away = held.placed[held.inliers]
-    away = away - away.mean(axis=0)
-    angle, moved = np.radians(min(tilt_deg, 89.0)), []
-    for side in np.linspace(0, 2 * np.pi, 8, endpoint=False):
-        tilted = away @ Rotation.from_rotvec(angle * np.array([np.cos(side), np.sin(side), 0.0])).as_matrix().T
-        factor = np.vdot(in_plane(tilted), in_plane(away)) / max(float(np.abs(in_plane(tilted) ** 2).sum()), 1e-300)
-        moved.append([abs(math.log(max(abs(factor), 1e-9))), abs(float(np.degrees(np.angle(factor))))])
-    scale, north_deg = np.max(moved, axis=0)
-    return math.expm1(min(50.0, scale)), float(north_deg)
+def _moved_by_tilts(likely: Likely, moments: Moments, level: np.ndarray) -> tuple[float, float]:
+    """By which share scale is off at most for up that is off, and by how many degrees north (95 %)."""
+    moments, ups = moments.turned(level), likely.ups @ level.T
+    factor = moments.fitted(ups)[0] / moments.fitted(np.array([[0.0, 0.0, 1.0]]))[0]
+    scale = likely.farther_end(np.log(np.maximum(np.abs(factor), 1e-300)))
+    return math.expm1(min(50.0, scale)), likely.farther_end(np.degrees(np.angle(factor)))
