@@ -188,18 +188,22 @@ def test_not_every_node_of_a_large_cluster_is_tried(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("said", "is_busy"),
+    ("said", "is_final"),
     [
-        (BUSY, True), ("Unable to contact slurm controller (connect failure)", True),
-        ("Batch job submission failed: Zero Bytes were transmitted or received", True),
-        ("Slurm temporarily unable to accept job, sleeping and retrying", True), (TOO_LARGE, False),
-        ("QOSMaxSubmitJobPerUserLimit", True), ("QOSMaxMemoryPerUser", False),
-        ("Batch job submission failed: Invalid account or account/partition combination specified", False),
-        ("Memory specification can not be satisfied", False),
+        (BUSY, False), ("Unable to contact slurm controller (connect failure)", False),
+        ("Batch job submission failed: Zero Bytes were transmitted or received", False),
+        ("Slurm temporarily unable to accept job, sleeping and retrying", False), (TOO_LARGE, True),
+        ("Batch job submission failed: Job violates accounting/QOS policy (job submit limit, user's size and/or time "
+         "limits)", False), ("AssocMaxSubmitJobLimit", False),
+        ("Batch job submission failed: Required node not available (down, drained or reserved)", False),
+        ("Batch job submission failed: Required partition not available (inactive or drain)", False),
+        ("I/O error writing script/output to file", False), ("cannot be run (Cannot allocate memory)", False),
+        ("Batch job submission failed: Invalid account or account/partition combination specified", True),
+        ("invalid partition specified: gpus", True), ("Memory specification can not be satisfied", True),
     ],
 )  # fmt: skip
-def test_a_controller_that_does_not_answer_is_told_from_one_that_refuses(said, is_busy):
-    assert SlurmError(f"sbatch: error: {said}").is_busy is is_busy
+def test_what_slurm_refuses_for_good_is_told_from_what_may_pass(said, is_final):
+    assert SlurmError(f"sbatch: error: {said}").is_final is is_final
 
 
 def test_a_controller_that_stays_silent_costs_attempts(tmp_path, monkeypatch):
@@ -207,7 +211,7 @@ def test_a_controller_that_stays_silent_costs_attempts(tmp_path, monkeypatch):
     slurm = Controller(monkeypatch, [None, *[BUSY] * 20], {})
     slurm.at = {3: lambda: slurm.end(1, 0, code=-11)}
     (result,) = run(tmp_path, 1, [])
-    assert result.reason.startswith(f"crashed 2 times, at last by SLURM, which does not answer (sbatch: error: {BUSY}")
+    assert result.reason.startswith(f"crashed 2 times, at last by SLURM, which does not take it (sbatch: error: {BUSY}")
 
 
 def test_what_slurm_never_took_is_not_cancelled_there(tmp_path, monkeypatch):

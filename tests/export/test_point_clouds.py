@@ -64,7 +64,7 @@ def test_what_las_rounds_to_is_said(tmp_path, unit):
     notes = registry.write_scene(tmp_path / "a.las", scene)
     step = laspy.read(tmp_path / "a.las").header.scales[0]
     assert f"coordinates are rounded to {step:g} {unit}" in notes
-    assert step == (1e-7 if unit == "units" else 0.001)
+    assert step == (1e-8 if unit == "units" else 0.001)
 
 
 def test_what_las_does_not_reach_is_refused_before_work(tmp_path):

@@ -18,11 +18,11 @@ SLURM_COMMANDS = ("sbatch", "squeue", "scancel", "scontrol")
 COMMAND_TIMEOUT_SECONDS = 120.0
 #: States of squeue in which a job has a place. SUSPENDED keeps it.
 RUNNING_STATES = ("RUNNING", "SUSPENDED", "COMPLETING", "STAGE_OUT", "SIGNALING")
-#: What SLURM's commands say where the controller is busy, starts again or is not reached, and may answer later, and
-#: where a user has as many jobs as are allowed at a time.
-_BUSY = re.compile(
-    r"timed out|unable to contact|connect(ion)? (failure|refused|reset|error)|communication|zero bytes|standby"
-    r"|transport endpoint|no route to host|unreachable|temporarily|MaxSubmitJob",
+#: What SLURM's commands say of a job that they will never take. All else may pass: a controller that is busy or starts
+#: again, as many jobs as a user may have at a time, nodes that are down.
+_FINAL = re.compile(
+    r"configuration is not available|can ?not be satisfied|more processors|not permitted|unrecognized option"
+    r"|invalid (account|partition|qos|feature|constraint|node|generic resource|user|job|wckey|reservation|time|memory)",
     re.IGNORECASE,
 )
 
@@ -64,9 +64,9 @@ class SlurmError(VdgsError):
     """SLURM refused, or does not answer."""
 
     @property
-    def is_busy(self) -> bool:
-        """Whether it did not answer; what it refused it would refuse again."""
-        return _BUSY.search(str(self)) is not None
+    def is_final(self) -> bool:
+        """Whether it would refuse the same again."""
+        return _FINAL.search(str(self)) is not None
 
 
 def require_slurm() -> None:

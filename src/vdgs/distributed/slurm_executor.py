@@ -172,9 +172,9 @@ class _SlurmEngine:
             self._not_taken(submission, error)
 
     def _not_taken(self, submission: _Submission, error: SlurmError) -> None:
-        """Ask again later where SLURM was busy; fail at once what it refused: with the nodes that it was to avoid, or
-        with more than it has, it would refuse that again."""
-        if error.is_busy and submission.failures < MAX_FAILED_POLLS:
+        """Ask again later where that may help; fail at once what SLURM refuses for good: with the nodes that it was to
+        avoid, or with more than it has."""
+        if not error.is_final and submission.failures < MAX_FAILED_POLLS:
             self._unanswered.append(submission)
             return
         said = f"({error}; the script: {submission.script})"
@@ -183,8 +183,8 @@ class _SlurmEngine:
 
     def _reason_of_refusal(self, attempt: _SlurmAttempt, error: SlurmError, said: str) -> tuple[str, bool]:
         """Why a job was not taken, and whether another attempt is in vain."""
-        if error.is_busy:
-            return f"SLURM, which does not answer {said}", False
+        if not error.is_final:
+            return f"SLURM, which does not take it {said}", False
         if not attempt.avoided:
             return f"SLURM does not take it {said}", True
         node = next(node for node in reversed(self.rejected_nodes) if node in attempt.avoided)

@@ -56,8 +56,10 @@ class LocalFrame(Similarity):
         """The same with their means where the map has them exactly: for files of points, which have no shapes."""
         if self.projection is None:
             return self.to_local(gaussians)
-        means = torch.from_numpy(self._map_points(gaussians.means.cpu().double().numpy()).astype(np.float32))
-        return replace(gaussians, means=means)
+        points = gaussians.means.cpu().double().numpy()
+        mapped = self._map_points(points)
+        means = np.where(np.isfinite(mapped), mapped, self.apply(points)).astype(np.float32)
+        return replace(gaussians, means=torch.from_numpy(means))
 
     def departure_note(self, means: Float[np.ndarray, "n 3"]) -> str | None:
         """How far Gaussians of these means (ground frame) stand from where the map has them, for people; None where
@@ -78,13 +80,14 @@ class LocalFrame(Similarity):
         """Metres between where the similarity and the map put points of the ground frame."""
         assert self.projection is not None
         points = means.astype(np.float64)
-        apart: np.ndarray = np.linalg.norm(self.apply(points) - self._map_points(points), axis=1)
+        mapped = self._map_points(points)
+        apart: np.ndarray = np.linalg.norm(np.nan_to_num(self.apply(points) - mapped, posinf=0, neginf=0), axis=1)
         return apart * (self.projection.meters_per_unit or 1.0)
 
     def _map_points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Points of the ground frame in local coordinates, by the map."""
+        """Points of the ground frame in local coordinates, by the map; not finite where it does not reach."""
         assert self.projection is not None
-        return self.projection.project(points) - self.facts.origin
+        return self.projection.project_if_reached(points) - self.facts.origin
 
     def to_ground(self, gaussians: Gaussians) -> Gaussians:
         """The inverse of `to_local`."""

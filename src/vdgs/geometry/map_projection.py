@@ -78,7 +78,11 @@ class MapProjection:
 
         Raises VdgsError where the target's projection does not reach.
         """
-        return self._checked(self._forward(np.asarray(points, np.float64)))
+        return self._checked(self.project_if_reached(points))
+
+    def project_if_reached(self, points: MapPoints) -> MapPoints:
+        """The same, not finite where the target's projection does not reach."""
+        return self._forward(np.asarray(points, np.float64))
 
     def to_ground(self, points: MapPoints) -> MapPoints:
         """The inverse of `project`."""

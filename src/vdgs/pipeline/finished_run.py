@@ -77,16 +77,26 @@ def _photograph_times(run: RunFolder) -> Iterator[int]:
     that they are in."""
     root = capture_root(Path(run.settings().capture_path))
     for folder in read_json_or_empty(run.cameras_file).get("input_folders", ()):
-        yield from _own_time(root / folder, run.path)
-        pictures = [each for each in os.scandir(root / folder) if Path(each.name).suffix.lower() in PICTURE_SUFFIXES]
-        yield from (os.stat(each.path).st_mtime_ns for each in pictures if not each.is_dir())
+        names = [each.name for each in os.scandir(root / folder) if _is_picture(each.name) and not each.is_dir()]
+        yield from _times_in(root / folder, names, run.path)
 
 
-def _own_time(folder: str | Path, output: Path) -> Iterator[int]:
-    """When something in a folder was added, removed or renamed last; none of a folder around the run, where runs and
-    what is written beside them come and go."""
-    if not Path(os.path.realpath(output)).is_relative_to(os.path.realpath(folder)):
+def _is_picture(name: str) -> bool:
+    return Path(name).suffix.lower() in PICTURE_SUFFIXES
+
+
+def _times_in(folder: str | Path, names: Sequence[str], output: Path) -> Iterator[int]:
+    """When these files of a folder changed last, and when one was added, removed or renamed.
+
+    In a folder around the run, where runs and what is written beside them come and go, the times at which pictures came
+    there or were renamed tell that in place of the folder's own; one that was removed is not noticed.
+    """
+    around = Path(os.path.realpath(output)).is_relative_to(os.path.realpath(folder))
+    if not around:
         yield os.stat(folder).st_mtime_ns
+    for name in names:
+        status = os.stat(os.path.join(folder, name))
+        yield max(status.st_mtime_ns, status.st_ctime_ns) if around and _is_picture(name) else status.st_mtime_ns
 
 
 def _times(path: Path, output: Path) -> Iterator[int]:
@@ -102,5 +112,4 @@ def _times(path: Path, output: Path) -> Iterator[int]:
             continue
         seen.add((status.st_dev, status.st_ino))
         inner[:] = [name for name in inner if not is_run(Path(folder, name))]
-        yield from _own_time(folder, output)
-        yield from (os.stat(os.path.join(folder, name)).st_mtime_ns for name in names)
+        yield from _times_in(folder, names, output)

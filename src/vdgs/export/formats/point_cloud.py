@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 POINT_DTYPE = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("opacity", "<f4")])
 #: LAS keeps whole numbers of this, where the unit of the coordinates is known.
 LAS_SCALE = 0.001
-#: Where it is not, of this part of how far they reach: what float32 holds.
-LAS_RELATIVE_SCALE = 1e-7
 #: The whole numbers are below this.
 LAS_RANGE = 2**31
 #: Coordinates of a known unit lie below this, from the origin.
@@ -78,7 +76,7 @@ def _las_scale(scene: ExportScene) -> float:
     if scene.metadata.unit != UNKNOWN_UNIT or scene.bounds is None:
         return LAS_SCALE
     reach = float(np.abs(scene.bounds).max()) or 1.0
-    return float(10.0 ** math.floor(math.log10(reach * LAS_RELATIVE_SCALE)))
+    return float(10.0 ** math.ceil(math.log10(reach / (0.99 * LAS_RANGE))))
 
 
 def _check_reach(path: Path, positions: np.ndarray, scale: float) -> None:
