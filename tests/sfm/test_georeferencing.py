@@ -226,7 +226,7 @@ def test_chance_in_the_plane_does_not_tilt_what_attitudes_or_views_level(altitud
         assert fit.altitude == ("none" if altitudes == "none" else "drifts")
         assert known - 2.0 < tilt_deg(fit, turn) < known + 0.1
         assert known > 2 * 3.0 or tilt_deg(fit, turn) == pytest.approx(known, abs=0.1)
-        assert fit.level_error_deg >= tilt_deg(fit, turn)
+        within.append(tilt_deg(fit, turn) <= fit.level_error_deg)
         within.append(abs(fit.similarity.scale / SCALE - 1) <= fit.scale_error)
     assert np.mean(within) >= 0.8
 

@@ -23,7 +23,7 @@ from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_colli
 #: Up is held to so many degrees. 95 % of errors in two directions lie within so many standard deviations of one.
 HELD_DEG, BOTH_WITHIN = 1e-3, 2.45
 #: Positions in the plane tell up where it would be off by so many times more without them (choice).
-TELL_BETTER = 1.2
+TELL_BETTER = 1.33
 
 
 def fit_positions(problem: Problem) -> PositionFit:
@@ -95,10 +95,10 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
     """
     up, level = problem.up, rotation_to_z(problem.up.direction)
     start = _upright_start(problem)
-    for _ in range(2):  # up along a slope explains positions as badly as any: the second starts at the likeliest
+    for is_likeliest in (False, True):  # what a start far off leaves is alike, and says nothing of the positions
         free = settle(problem, start, "unused")
         moments = Moments.of((problem.centers @ level.T)[free.inliers], problem.targets[free.inliers])
-        likely = likely_tilts(moments, *_worth(free, problem), up.deviation_deg, problem.scale)
+        likely = likely_tilts(moments, *_worth(free, problem, is_likeliest), up.deviation_deg, problem.scale)
         start = _upright_start(replace(problem, up=replace(up, direction=level.T @ likely.likeliest)))
     chosen, level_deg = _chosen(likely, BOTH_WITHIN * up.deviation_deg)
     held = replace(up, direction=level.T @ chosen, deviation_deg=HELD_DEG)
@@ -114,10 +114,11 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
     )
 
 
-def _worth(fit: PositionFit, problem: Problem) -> tuple[float, float]:
-    """As how many independent positions those that are trusted count, where residuals follow each other alike; and by
-    how much positions are usually off, in metres."""
+def _worth(fit: PositionFit, problem: Problem, is_likeliest: bool) -> tuple[float, float]:
+    """As how many independent positions those that are trusted count, fewer where residuals of the likeliest fit follow
+    each other alike; and by how much positions are usually off, in metres."""
     alike = float(alike_factors(fit.residuals[fit.inliers], problem.in_order(fit.inliers))[:2].max())
+    alike = alike if is_likeliest else 1.0
     usual = USUAL_M[0] if problem.stated is None else float(np.median(problem.stated[:, :2]))
     return int(fit.inliers.sum()) / alike**2, usual
 
