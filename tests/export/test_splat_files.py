@@ -354,7 +354,7 @@ def test_only_files_of_ours_may_be_written_over(tmp_path, name):
             path.write_bytes(free)
         registry.check_not_foreign(path)
     path.write_bytes(b"ply\nformat ascii 1.0\ncomment of somebody else\n")
-    with pytest.raises(VdgsError, match="is there already, and nothing says that vdgs wrote it"):
+    with pytest.raises(VdgsError, match="is there already and was not written by vdgs"):
         registry.check_not_foreign(path)
     path.unlink()
     registry.write_scene(path, ExportScene.of(random_gaussians(20, 1)))
@@ -365,7 +365,7 @@ def test_only_files_of_ours_may_be_written_over(tmp_path, name):
 def test_facts_of_others_beside_a_file_stay(tmp_path, name):
     beside = metadata_path(tmp_path / name)
     beside.write_text('{"mine": 1}')
-    with pytest.raises(VdgsError, match=rf"{re.escape(beside.name)}: is there already, and nothing says that vdgs wrote it"):
+    with pytest.raises(VdgsError, match=rf"{re.escape(beside.name)}: is there already and was not written by vdgs"):
         registry.check_not_foreign(tmp_path / name)
 
 
@@ -373,7 +373,7 @@ def test_facts_of_others_beside_a_file_stay(tmp_path, name):
 def test_a_coordinate_system_beside_a_ply_is_ours_where_the_ply_is(tmp_path, name):
     path, beside = tmp_path / name, tmp_path / f"{name}.prj"
     beside.write_text("PROJCS[mine]")
-    with pytest.raises(VdgsError, match=r"\.prj: is there already, and nothing says that vdgs wrote it"):
+    with pytest.raises(VdgsError, match=r"\.prj: is there already and was not written by vdgs"):
         registry.check_not_foreign(path)
     beside.unlink()
     registry.write_scene(path, ExportScene.of(random_gaussians(20, 1), PLACED))

@@ -219,9 +219,7 @@ def check_ours(path: Path, *beside: Path) -> None:
             return
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}). Choose another name.") from error
-    raise VdgsError(
-        f"{path}: is there already, and nothing says that vdgs wrote it. Choose another name, or remove the file."
-    )
+    raise VdgsError(f"{path}: is there already and was not written by vdgs. Choose another name, or remove the file.")
 
 
 def _names_vdgs(file: Path) -> bool:
