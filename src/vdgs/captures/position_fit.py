@@ -22,8 +22,9 @@ from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_colli
 
 #: Up is held to so many degrees. 95 % of errors in two directions lie within so many standard deviations of one.
 HELD_DEG, BOTH_WITHIN = 1e-3, 2.45
-#: Positions in the plane tell up where it would be off by so many times more without them (choice).
-TELL_BETTER = 1.33
+#: Positions of a flight at about one height tell up where it would be off by so many times more without them: heights
+#: differ by less than this share of how far cameras spread (choice).
+TELL_BETTER, ONE_HEIGHT = 1.5, 0.15
 
 
 def fit_positions(problem: Problem) -> PositionFit:
@@ -100,7 +101,7 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
         moments = Moments.of((problem.centers @ level.T)[free.inliers], problem.targets[free.inliers])
         likely = likely_tilts(moments, *_worth(free, problem, is_likeliest), up.deviation_deg, problem.scale)
         start = _upright_start(replace(problem, up=replace(up, direction=level.T @ likely.likeliest)))
-    chosen, level_deg = _chosen(likely, BOTH_WITHIN * up.deviation_deg)
+    chosen, level_deg = _chosen(likely, moments, BOTH_WITHIN * up.deviation_deg)
     held = replace(up, direction=level.T @ chosen, deviation_deg=HELD_DEG)
     fit = settle(replace(problem, up=held), _upright_start(replace(problem, up=held)), "unused")
     scale, north_deg = _moved_by_tilts(likely, moments, rotation_to_z(chosen))
@@ -123,14 +124,15 @@ def _worth(fit: PositionFit, problem: Problem, is_likeliest: bool) -> tuple[floa
     return int(fit.inliers.sum()) / alike**2, usual
 
 
-def _chosen(likely: Likely, known_deg: float) -> tuple[np.ndarray, float]:
+def _chosen(likely: Likely, moments: Moments, known_deg: float) -> tuple[np.ndarray, float]:
     """Up, where z is up as it is known without positions, and its error in degrees."""
     told = np.array([0.0, 0.0, 1.0])
     radius, best = min(
         ((likely.radius_deg(up), up) for up in (likely.middle, likely.likeliest)),
         key=lambda each: each[0],
     )
-    if likely.radius_deg(told) <= TELL_BETTER * radius:
+    is_flat = best @ moments.spread @ best < ONE_HEIGHT**2 * np.trace(moments.spread)
+    if likely.radius_deg(told) <= (TELL_BETTER if is_flat else 1.0) * radius:
         return told, max(known_deg, likely.radius_deg(told))
     return best, radius
 
