@@ -59,9 +59,10 @@ def partition_command(arguments: list[str]) -> None:
         PartitionArguments, arguments, "partition",
         lambda own: {"partition": own.partition, "assignment": own.assignment},
     )  # fmt: skip
-    from vdgs.pipeline.count_visibility import count_run_visibility
+    from vdgs.pipeline.count_visibility import count_run_visibility, is_visibility_counted
     from vdgs.pipeline.find_motion import find_run_motion
     from vdgs.pipeline.partition_stage import explain_view, is_cut, partition_run
+    from vdgs.runs.motion_masks import has_motion_record
     from vdgs.runs.run_context import RunContext
 
     device, console = set_up_compute(args.device, args.threads), make_console(args.quiet)
@@ -69,8 +70,10 @@ def partition_command(arguments: list[str]) -> None:
     method = replace(method, partition=args.partition, assignment=args.assignment)
     update_run_settings(run, method, args.overwrite, console)
     if not is_cut(run):  # a look at the cut of a trained run changes nothing
-        find_run_motion(context, console, device)
-        count_run_visibility(context, console)
+        if not has_motion_record(run):
+            find_run_motion(context, console, device)
+        if not is_visibility_counted(run):
+            count_run_visibility(context, console)
     partition_run(context, console, device, execution)
     if args.explain is not None:
         explain_view(run, args.explain, console)

@@ -12,9 +12,15 @@ from rich.console import Console
 from vdgs.partition.plots import block_maps as figures
 from vdgs.runs.open_run import check_has_anchors
 from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import load_or_count_visibility
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.visibility.visibility_counts import visibility_stats
+
+
+def is_visibility_counted(run: RunFolder) -> bool:
+    """Whether `count_run_visibility` has nothing to do."""
+    return read_json_or_empty(run.visibility / "visibility.json").get("key") == run.keys().visibility
 
 
 def count_run_visibility(context: RunContext, console: Console) -> None:
@@ -24,7 +30,7 @@ def count_run_visibility(context: RunContext, console: Console) -> None:
     """
     run = context.run
     file, key = run.visibility / "visibility.json", run.keys().visibility
-    if read_json_or_empty(file).get("key") == key:
+    if is_visibility_counted(run):
         console.print(f"{file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
