@@ -45,6 +45,21 @@ def test_all_attitudes_that_scatter_count_however_the_camera_hangs(share):
     assert np.degrees(np.sqrt(np.square(off).mean())) < 0.1
 
 
+def test_two_kinds_of_attitudes_that_are_some_degrees_apart_both_count():
+    """As of a gimbal that lags there and back: neither is wrong, and the rarer one is worth as much."""
+    rng = np.random.default_rng(2)
+    yaws = np.full(18, 90.0)
+    rotations, gravity = tilted(yaws, 0.0, 0.3, rng)
+    lags = np.where(np.arange(18) < 11, 1.2, -1.2)
+    gravity = np.stack(
+        [Rotation.from_euler("x", lag, degrees=True).apply(g) for lag, g in zip(lags, gravity, strict=True)]
+    )
+    tilt, several, agree = tilt_of_attitudes(rotations, gravity)
+    assert not several
+    assert agree.all()
+    assert np.degrees(np.linalg.norm(tilt - TILT)) == pytest.approx(1.2 * 4 / 18, abs=0.2)
+
+
 @pytest.mark.parametrize("wrong_deg", [20.0, 45.0, 80.0])
 def test_a_minority_of_wrong_attitudes_tilts_nothing(wrong_deg):
     rng = np.random.default_rng(1)

@@ -8,8 +8,9 @@ import numpy as np
 MIN_HEADING_SPREAD = 0.3
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG = 1.0
-#: Attitudes farther from where the others have up than so many medians (some 3.5 standard deviations) are wrong.
-MEDIANS_AWAY = 3.0
+#: Attitudes farther from where the others have up than so many medians (some 3.5 standard deviations), and so many
+#: degrees, are wrong: flown there and back, a camera that hangs by 2.5 degrees leaves 5 between the directions (choice).
+MEDIANS_AWAY, WRONG_DEG = 3.0, 5.0
 #: Rounds of the least sum of distances that tells them, and the distance (radians) from which on it counts.
 ROUNDS, LEAST_AWAY = 20, 1e-4
 
@@ -29,7 +30,7 @@ def tilt_of_attitudes(rotations: np.ndarray, gravity: np.ndarray) -> tuple[np.nd
     for _ in range(ROUNDS):
         away = np.linalg.norm(off - unknown @ _least_squares(unknown, off, weights), axis=1)
         weights = 1 / np.maximum(away, LEAST_AWAY)
-    agree = away <= max(MEDIANS_AWAY * float(np.median(away)), np.radians(HANGS_DEG))
+    agree = away <= max(MEDIANS_AWAY * float(np.median(away)), np.radians(WRONG_DEG))
     if several and not _tells(both[agree]):
         unknown, several = rotations[:, :, :2], False
     return _least_squares(unknown, off, agree.astype(float))[:2], several, agree
