@@ -50,10 +50,7 @@ def test_two_kinds_of_attitudes_that_are_some_degrees_apart_both_count():
     rng = np.random.default_rng(2)
     yaws = np.full(18, 90.0)
     rotations, gravity = tilted(yaws, 0.0, 0.3, rng)
-    lags = np.where(np.arange(18) < 11, 1.2, -1.2)
-    gravity = np.stack(
-        [Rotation.from_euler("x", lag, degrees=True).apply(g) for lag, g in zip(lags, gravity, strict=True)]
-    )
+    gravity = Rotation.from_euler("x", np.where(np.arange(18) < 11, 1.2, -1.2), degrees=True).apply(gravity)
     tilt, several, agree = tilt_of_attitudes(rotations, gravity)
     assert not several
     assert agree.all()

@@ -9,7 +9,7 @@ MIN_HEADING_SPREAD = 0.3
 #: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
 HANGS_DEG = 1.0
 #: Attitudes farther from where the others have up than so many medians (some 3.5 standard deviations), and so many
-#: degrees, are wrong: flown there and back, a camera that hangs by 2.5 degrees leaves 5 between the directions (choice).
+#: degrees, are wrong: there and back, a camera that hangs by 2.5 degrees leaves 5 between the directions (choice).
 MEDIANS_AWAY, WRONG_DEG = 3.0, 5.0
 #: Rounds of the least sum of distances that tells them, and the distance (radians) from which on it counts.
 ROUNDS, LEAST_AWAY = 20, 1e-4
