@@ -50,7 +50,8 @@ def test_two_kinds_of_attitudes_that_are_some_degrees_apart_both_count():
     rng = np.random.default_rng(2)
     yaws = np.full(18, 90.0)
     rotations, gravity = tilted(yaws, 0.0, 0.3, rng)
-    gravity = Rotation.from_euler("x", np.where(np.arange(18) < 11, 1.2, -1.2), degrees=True).apply(gravity)
+    lags = np.where(np.arange(18) < 11, 1.2, -1.2)[:, None]
+    gravity = Rotation.from_euler("x", lags, degrees=True).apply(gravity)
     tilt, several, agree = tilt_of_attitudes(rotations, gravity)
     assert not several
     assert agree.all()
