@@ -6,8 +6,6 @@ import numpy as np
 
 #: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
 MIN_HEADING_SPREAD = 0.3
-#: How far a camera may hang beside what is recorded, in degrees: flown in several directions that cancels (choice).
-HANGS_DEG = 1.0
 #: Attitudes farther from where the others have up than so many medians (some 3.5 standard deviations), and so many
 #: degrees, are wrong: there and back, a camera that hangs by 2.5 degrees leaves 5 between the directions (choice).
 MEDIANS_AWAY, WRONG_DEG = 3.0, 5.0

@@ -16,7 +16,7 @@ from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity, geometric_median, is_collinear, rotation_to_z
-from vdgs.sfm.attitude_tilt import HANGS_DEG, tilt_of_attitudes
+from vdgs.sfm.attitude_tilt import tilt_of_attitudes
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -36,8 +36,9 @@ LOOKED_UP = (
     " Or are the recorded attitudes wrong, by which the cameras looked up (a pitch of +90° where straight down "
     "is -90°)?"
 )
-#: How far a camera may hang beside what is recorded, in degrees, where all look one way (choice).
-HANGS_ALIKE_DEG = 2.5
+#: How far a camera may hang beside what is recorded, in degrees: flown in several directions, where that cancels, and
+#: where all look one way (choice).
+HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
