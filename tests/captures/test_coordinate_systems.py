@@ -250,10 +250,10 @@ def test_a_system_is_read_as_often_for_many_rows_as_for_few(tmp_path, monkeypatc
     )
     x, y = (33_500_000, 5_600_000) if "x,y" in head else (15, 48)
     counts = []
-    for count in (3, 30):
+    for count in (3, 3, 30):  # the first also finds what is kept for the others
         rows = [f"{k}.jpg,{x + k * 1e-3},{y},500" for k in range(count)]
         (tmp_path / f"{count}.csv").write_text("\n".join([head, *rows]))
         parsed.clear()
         assert len(read_gps_table(tmp_path / f"{count}.csv").rows) == count
         counts.append(len(parsed))
-    assert counts[0] == counts[1] > 0
+    assert counts[0] >= counts[1] == counts[2] > 0

@@ -187,22 +187,28 @@ def _to_latitude(crs: Any, target: str, own_axes: bool = False) -> Callable[...,
     `always_xy` of pyproj does not see that latitude is first where a system with heights holds one with TOWGS84, as
     Metashape writes it.
     """
-    import pyproj
-
     if own_axes:
-        return pyproj.Transformer.from_crs(crs, target).transform
+        return _transformer(crs, target, False).transform
     unseen = crs.is_compound and any(part.is_bound for part in crs.sub_crs_list)
     north_first = [axis.direction.lower() for axis in crs.axis_info[:2]] == ["north", "east"]
     if unseen and north_first:
-        change = pyproj.Transformer.from_crs(crs, target)
+        change = _transformer(crs, target, False)
         return lambda x, y, *z: change.transform(y, x, *z)
-    change = pyproj.Transformer.from_crs(crs, target, always_xy=True)
+    change = _transformer(crs, target, True)
 
     def changed(x: Any, y: Any, *z: Any) -> tuple[Any, ...]:
         longitude, latitude, *height = change.transform(x, y, *z)
         return latitude, longitude, *height
 
     return changed
+
+
+@cache
+def _transformer(crs: Any, target: str, always_xy: bool) -> Any:
+    """PROJ's way from a system to `target`, kept: it takes up to a second to be found."""
+    import pyproj
+
+    return pyproj.Transformer.from_crs(crs, target, always_xy=always_xy)
 
 
 def _is_exchanged(crs: Any, change: Callable[..., tuple[Any, ...]], x: np.ndarray, y: np.ndarray) -> bool:
@@ -270,8 +276,10 @@ def look_like_degrees(places: np.ndarray) -> bool:
     return bool((np.abs(places[0]) > 1).any() and 0 < spread.max() < _ONE_PLACE)
 
 
+@cache
 def _has_grids(crs: Any) -> bool:
-    """Whether the best way from a system with heights above a geoid to those above the ellipsoid is at hand."""
+    """Whether the best way from a system with heights above a geoid to those above the ellipsoid is at hand. PROJ looks
+    seconds for it, and a table asks several times."""
     import pyproj
 
     with warnings.catch_warnings():  # said in words instead
