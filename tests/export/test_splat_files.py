@@ -21,6 +21,7 @@ from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metada
 from vdgs.export.formats.gaussian_ply import read_ply_chunks
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
+from vdgs.kernels import get_backend
 from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 
@@ -242,6 +243,22 @@ def test_a_sog_keeps_the_few_that_are_larger_and_brighter_than_all_others(tmp_pa
     read = read.select(torch.cdist(wanted.means, read.means).argmin(1))
     torch.testing.assert_close(read.log_scales, wanted.log_scales, atol=0.1, rtol=0)
     torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize(("size", "color"), [(5.0, 5.0), (20.0, 80.0)])
+def test_one_that_is_far_larger_and_brighter_makes_a_sog_no_coarser_for_the_others(tmp_path, size, color):
+    """The entries of the codebooks go to what is there, not to the void before it."""
+    written = random_gaussians(20_000, 0)
+    errors = []
+    for _ in range(2):
+        registry.write_scene(tmp_path / "a.sog", ExportScene.of(written))
+        read, wanted = independent(tmp_path / "a.sog"), turned(written, Y_DOWN.turn)
+        order = get_backend(torch.device("cpu")).morton_order(wanted.means)
+        off = [(read.log_scales - wanted.log_scales[order]), (read.sh0 - wanted.sh0[order])]
+        errors.append([float(each.square().mean().sqrt()) for each in off])
+        assert max(float(each.abs().max()) for each in off) < 0.1
+        written.log_scales[77, 1], written.sh0[77, 2] = size, color
+    np.testing.assert_array_less(errors[1], 1.02 * np.array(errors[0]))
 
 
 def glb_arrays(path: Path) -> tuple[pygltflib.GLTF2, dict[str, np.ndarray]]:
