@@ -398,6 +398,19 @@ def test_a_coordinate_system_beside_a_ply_is_ours_where_the_ply_is(tmp_path, nam
     registry.check_not_foreign(path)
 
 
+@pytest.mark.parametrize("code", ["EPSG:32611", "EPSG:32633+5773"])
+def test_a_coordinate_system_of_a_ply_that_was_deleted_is_still_ours(tmp_path, code):
+    pyproj = pytest.importorskip("pyproj")
+    crs, path, beside = pyproj.CRS.from_user_input(code), tmp_path / "a.ply", tmp_path / "a.ply.prj"
+    registry.write_scene(path, ExportScene.of(random_gaussians(20, 1), replace(PLACED, crs=crs.to_wkt())))
+    path.unlink()
+    registry.check_not_foreign(path)
+    for theirs in ("WKT1_ESRI", "WKT1_GDAL"):
+        beside.write_text(crs.to_wkt(theirs) + "\n")
+        with pytest.raises(VdgsError, match=r"\.prj: is there already and was not written by vdgs"):
+            registry.check_not_foreign(path)
+
+
 def test_scenes_that_are_not_what_they_announce_are_refused(tmp_path):
     some = random_gaussians(20, 1)
     with pytest.raises(ValueError, match="21 Gaussians were announced, 20 came"):

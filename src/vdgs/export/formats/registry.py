@@ -11,7 +11,7 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
 from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate, metadata_path
 from vdgs.export.formats.file_folders import FileFolder
-from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, write_ply
+from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, reads_as_written_beside, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_page, html_capacity, read_html_chunks, write_html
 from vdgs.export.formats.point_cloud import (
@@ -219,7 +219,9 @@ def check_not_foreign(path: Path) -> None:
     if chosen.facts_file is metadata_path:
         check_ours(metadata_path(path))
     elif chosen.facts_file is not None:
-        check_ours(chosen.facts_file(path), path)  # names no program: it is ours beside a file of ours
+        beside = chosen.facts_file(path)  # names no program: it is ours beside a file of ours
+        if not (beside.is_file() and reads_as_written_beside(beside)):
+            check_ours(beside, path)
 
 
 def check_ours(path: Path, *beside: Path) -> None:
