@@ -143,7 +143,10 @@ def _tie_points(flight: TrueFlight, color_kind: str) -> dict[str, bytes]:
     lists = {
         "points0.ply": _ply({**dict(zip("xyz", places.T, strict=True)), "id": numbers}),
         "tracks.ply": _ply(
-            {name: np.full(len(numbers), (10 + k) * steps, color_kind) for k, name in enumerate(("red", "green", "blue"))}
+            {
+                name: np.full(len(numbers), (10 + k) * steps, color_kind)
+                for k, name in enumerate(("red", "green", "blue"))
+            }
         ),
     }
     for index in range(len(flight.names)):

@@ -128,8 +128,8 @@ def _too_short(header: _Header, file: Path) -> CaptureError:
 
 
 def vertex_colors(vertices: np.ndarray, types: Mapping[str, str]) -> np.ndarray:
-    """Colors [n, 3] uint8 of vertices as `read_vertices` gives them: those of 16 bits and fractions are scaled, mid-gray
-    where there are none."""
+    """Colors [n, 3] uint8 of vertices as `read_vertices` gives them, of 16 bits and fractions too; mid-gray where there
+    are none."""
     names = {name.lower(): name for name in vertices.dtype.names or ()}
     triple = next((triple for triple in COLORS if set(triple) <= set(names)), None)
     if triple is None:
