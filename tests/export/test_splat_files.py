@@ -271,7 +271,7 @@ def glb_arrays(path: Path) -> tuple[pygltflib.GLTF2, dict[str, np.ndarray]]:
             continue
         accessor = gltf.accessors[index]
         view = gltf.bufferViews[accessor.bufferView]
-        kind, width = np.float32 if accessor.componentType == 5126 else np.uint8, widths[accessor.type]
+        kind, width = {5126: np.float32, 5123: np.uint16}[accessor.componentType], widths[accessor.type]
         found[name] = np.frombuffer(blob, kind, accessor.count * width, view.byteOffset).reshape(-1, width)
     return gltf, found
 
@@ -301,7 +301,10 @@ def test_a_glb_holds_the_turned_scene_with_all_its_bits(tmp_path, degree):
     ]
     if degree:
         np.testing.assert_array_equal(np.stack(further, 1), wanted.shN.numpy())
-    assert found["COLOR_0"].dtype == np.uint8
+    light = found["COLOR_0"].astype(np.float64) / 65535  # linear, as the base specification has it
+    np.testing.assert_allclose(light[:, 3], wanted.opacity_logits.sigmoid().numpy(), atol=1e-5)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)[:, :3]
+    np.testing.assert_allclose(srgb, np.clip(0.5 + 0.28209479 * wanted.sh0.numpy(), 0, 1), atol=1e-4)
 
 
 def test_what_no_spz_can_hold_is_refused_before_work(tmp_path):
