@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from support.captures import TinyScene, write_colmap
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
@@ -264,6 +265,31 @@ def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
     for frame, x in (("source", 1.0), ("ground", 0.0)):
         camera = load_path(write(tmp_path, {**content, "frame": frame}), TEMPLATE, ground).cameras[0]
         assert camera.position[0] == pytest.approx(x)
+
+
+@pytest.mark.parametrize(("text", "given"), [(True, ""), (True, "images.txt"), (False, ""), (False, "images.bin")])
+def test_the_images_of_a_colmap_model_are_a_path(tmp_path: Path, text: bool, given: str):
+    """In order of their names, in the world of the capture, without distortion, all of one size."""
+    poses = {f"DJI_{k}.jpg": standing([float(k), 0, 9], [float(k), 5, 0], fx=300.0 + k) for k in (10, 1, 2)}
+    poses["DJI_10.jpg"] = replace(poses["DJI_10.jpg"], width=640, height=360, fx=620.0, fy=820.0, cx=320.0, cy=180.0)
+    folder = write_colmap(
+        tmp_path, TinyScene(poses, np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), text=text, images=None,
+        model="OPENCV", extra=(0.1, -0.05, 0.0, 0.0),
+    )  # fmt: skip
+    ground = GroundFrame(
+        scale=2.0, rotation=np.eye(3), translation=np.array([1.0, 0, 0]), metric=False, description="test"
+    )
+    path = load_path(folder / given, TEMPLATE, ground)
+    places = [camera.position for camera in path.cameras]
+    np.testing.assert_allclose(places, [[3, 0, 18], [5, 0, 18], [21, 0, 18]], atol=1e-9)
+    found = [(camera.fx, camera.fy, camera.cx, camera.width, camera.height) for camera in path.cameras]
+    np.testing.assert_allclose(found, [(301, 410, 160, 320, 180), (302, 410, 160, 320, 180), (310, 410, 160, 320, 180)])
+    assert len(load_path(folder / given, TEMPLATE, ground, seconds=2.0, fps=10.0).cameras) == 20
+
+
+def test_a_folder_without_a_colmap_model_is_no_path(tmp_path: Path):
+    with pytest.raises(VdgsError, match="no COLMAP model here"):
+        load_path(tmp_path, TEMPLATE)
 
 
 #: A key frame.
