@@ -329,6 +329,7 @@ def test_the_size_of_a_film_is_what_nerfstudio_reads_not_the_aspect_of_its_frame
         ({"camera_path": [{}]}, "camera_to_world"),
         ({"camera_path": [{"camera_to_world": np.eye(4).tolist()}], "frame": "moon"}, "ground or source"),
         ("path", "list of key frames"),
+        ({"camera_angle_x": 0.8, "frames": [{"transform_matrix": np.eye(4).tolist()}]}, "which is no camera path"),
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "fps": -3}, "fps is -3; it must be"),
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "second": 3}, "did you mean 'seconds'"),
         ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fovdeg": 60}], "key frame 0: there is no 'fovdeg'; did you"),

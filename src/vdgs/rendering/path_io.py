@@ -124,6 +124,11 @@ def _read(file: Path) -> Mapping[str, Any]:
         content = {"keyframes": content}
     if not isinstance(content, Mapping):
         raise VdgsError(f"{file}: a camera path is a list of key frames, or an object with `keyframes`.")
+    if "frames" in content:
+        raise VdgsError(
+            f"{file}: lists photographs and their poses (as transforms.json does), which is no camera path. Write each "
+            "pose as camera_from_world of a key frame, or give the folder of a COLMAP model of them."
+        )
     return content
 
 
