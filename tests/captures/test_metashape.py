@@ -272,11 +272,11 @@ def test_a_camera_whose_transform_is_zeros_is_named_and_the_others_are_used(tmp_
     assert any("all zeros" in each and "(DJI_9)" in each for each in source.warnings)
 
 
-@pytest.mark.parametrize("suffix", [".psx", ".psz"])
-def test_a_project_is_read_with_its_tie_points(tmp_path, suffix):
+@pytest.mark.parametrize(("suffix", "color_kind"), [(".psx", "u1"), (".psz", "u1"), (".psx", "u2")])
+def test_a_project_is_read_with_its_tie_points(tmp_path, suffix, color_kind):
     flight = true_flight()
     flight.touch(tmp_path)
-    file = write_project(tmp_path, flight, suffix=suffix)
+    file = write_project(tmp_path, flight, suffix=suffix, color_kind=color_kind)
     for given in (tmp_path, file):
         source = read_files(given, OPTIONS)
         assert_true(source, flight)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin, TiffTags
 
 from support.raw_writer import write_dng
 from vdgs.captures import optional_decoders
@@ -12,6 +14,7 @@ from vdgs.captures.capture_dates import date_taken
 from vdgs.captures.color_profiles import ADOBE_RGB, matrix_profile
 from vdgs.captures.image_files import decode_image, find_images, read_header, verify_image
 from vdgs.captures.image_tags import read_tags
+from vdgs.captures.tiff_orientation import without_orientation
 from vdgs.errors import CaptureError
 
 COLORS = np.array([[200, 100, 50], [60, 160, 90], [40, 70, 190], [128, 128, 128], [240, 240, 240], [30, 30, 30]])
@@ -135,6 +138,22 @@ def test_tiffs_are_taken_as_their_files_have_them(tmp_path, orientation, kind):
     assert (found.width, found.height) == (header.width, header.height) == (WIDE * len(COLORS), 120)
     assert np.array_equal(decode_image(file)[0], expected)
     assert verify_image(file).has_content
+
+
+@pytest.mark.parametrize("kind", [TiffTags.BYTE, TiffTags.SHORT, TiffTags.LONG])
+@pytest.mark.parametrize("values", ["<u2", ">u2"])
+def test_the_orientation_of_a_tiff_is_set_by_its_type_and_order_of_bytes(tmp_path, kind, values):
+    """Half a number would be another one, or none."""
+    file, tags = tmp_path / "a.tif", TiffImagePlugin.ImageFileDirectory_v2()
+    tags.tagtype[0x0112], tags[0x0112] = kind, b"\x06" if kind == TiffTags.BYTE else 6
+    gray = patches()[..., 0]
+    Image.fromarray((gray.astype(np.uint16) * 257).astype(values)).save(file, tiffinfo=tags)
+    assert file.read_bytes()[:2] == (b"II" if values == "<u2" else b"MM")
+    assert read_tags(file).tags[0x0112] in (6, b"\x06")
+    upright = without_orientation(np.fromfile(file, np.uint8)).tobytes()
+    with Image.open(io.BytesIO(upright)) as image:
+        assert image.getexif()[0x0112] in (1, b"\x01")
+    assert np.array_equal(decode_image(file)[0], gray[..., None].repeat(3, axis=2))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

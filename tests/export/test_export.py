@@ -26,7 +26,9 @@ from vdgs.export import local_bake
 from vdgs.export.bake import collect_contributions
 from vdgs.export.export_run import RECORD_FILE, export_run, resolve_request
 from vdgs.export.formats import html, registry
-from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, make_local_frame
+from vdgs.export.formats.export_scene import ExportMetadata, InitialView
+from vdgs.export.gaussian_selection import rows_within_reach, select_rows
+from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, make_local_frame
 from vdgs.export.programs import PROGRAMS
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
@@ -459,6 +461,23 @@ def test_a_file_goes_without_the_few_that_lie_beyond_its_reach(export, tmp_path,
     pixels[there] = pixels.sum()
     with pytest.raises(VdgsError, match="2048"):
         export("near.spz", model=model)
+
+
+@pytest.mark.parametrize(("unit", "reach", "outlier", "left"), [
+    ("units", 3e6, 9e6, 0), ("units", 3.0, 1e5, 1), ("units", 3.0, 4000.0, 0), ("metre", 3.0, 1e5, 0),
+    ("metre", 3.0, 9e6, 1),
+])  # fmt: skip
+def test_las_reaches_what_a_scene_of_unknown_unit_reaches(tmp_path, unit, reach, outlier, left):
+    """Whether 2 million units are far is not known; what would make the steps coarse for all others is."""
+    pytest.importorskip("laspy")
+    means = np.random.default_rng(0).uniform(-reach, reach, (1000, 3))
+    means[5] = (0.0, 0.0, -outlier)
+    pixels = np.where(np.arange(1000) == 5, 0.01, 10.0)
+    frame = LocalFrame(1.0, np.eye(3), np.zeros(3), ExportMetadata(unit=unit))
+    path = tmp_path / "a.las"
+    request = resolve_request(ExportRequest(run=tmp_path, output=(path,)))
+    rows = select_rows({path: frame}, means, pixels, request, InitialView((0, 0, 9), (0, 0, 0)), QUIET)[path]
+    assert len(rows) == len(rows_within_reach(path, frame, means)) == 1000 - left
 
 
 def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):

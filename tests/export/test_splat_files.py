@@ -21,6 +21,7 @@ from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, metada
 from vdgs.export.formats.gaussian_ply import read_ply_chunks
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
+from vdgs.kernels import get_backend
 from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 
@@ -244,6 +245,22 @@ def test_a_sog_keeps_the_few_that_are_larger_and_brighter_than_all_others(tmp_pa
     torch.testing.assert_close(read.sh0, wanted.sh0, atol=0.1, rtol=0)
 
 
+@pytest.mark.parametrize(("size", "color"), [(5.0, 5.0), (20.0, 80.0)])
+def test_one_that_is_far_larger_and_brighter_makes_a_sog_no_coarser_for_the_others(tmp_path, size, color):
+    """The entries of the codebooks go to what is there, not to the void before it."""
+    written = random_gaussians(20_000, 0)
+    errors = []
+    for _ in range(2):
+        registry.write_scene(tmp_path / "a.sog", ExportScene.of(written))
+        read, wanted = independent(tmp_path / "a.sog"), turned(written, Y_DOWN.turn)
+        order = get_backend(torch.device("cpu")).morton_order(wanted.means)
+        off = [(read.log_scales - wanted.log_scales[order]), (read.sh0 - wanted.sh0[order])]
+        errors.append([float(each.square().mean().sqrt()) for each in off])
+        assert max(float(each.abs().max()) for each in off) < 0.1
+        written.log_scales[77, 1], written.sh0[77, 2] = size, color
+    np.testing.assert_array_less(errors[1], 1.02 * np.array(errors[0]))
+
+
 def glb_arrays(path: Path) -> tuple[pygltflib.GLTF2, dict[str, np.ndarray]]:
     """A GLB as pygltflib reads it, and the numbers of every attribute."""
     gltf = pygltflib.GLTF2().load(str(path))
@@ -254,7 +271,7 @@ def glb_arrays(path: Path) -> tuple[pygltflib.GLTF2, dict[str, np.ndarray]]:
             continue
         accessor = gltf.accessors[index]
         view = gltf.bufferViews[accessor.bufferView]
-        kind, width = np.float32 if accessor.componentType == 5126 else np.uint8, widths[accessor.type]
+        kind, width = {5126: np.float32, 5123: np.uint16}[accessor.componentType], widths[accessor.type]
         found[name] = np.frombuffer(blob, kind, accessor.count * width, view.byteOffset).reshape(-1, width)
     return gltf, found
 
@@ -284,7 +301,10 @@ def test_a_glb_holds_the_turned_scene_with_all_its_bits(tmp_path, degree):
     ]
     if degree:
         np.testing.assert_array_equal(np.stack(further, 1), wanted.shN.numpy())
-    assert found["COLOR_0"].dtype == np.uint8
+    light = found["COLOR_0"].astype(np.float64) / 65535  # linear, as the base specification has it
+    np.testing.assert_allclose(light[:, 3], wanted.opacity_logits.sigmoid().numpy(), atol=1e-5)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)[:, :3]
+    np.testing.assert_allclose(srgb, np.clip(0.5 + 0.28209479 * wanted.sh0.numpy(), 0, 1), atol=1e-4)
 
 
 def test_what_no_spz_can_hold_is_refused_before_work(tmp_path):
@@ -379,6 +399,19 @@ def test_a_coordinate_system_beside_a_ply_is_ours_where_the_ply_is(tmp_path, nam
     registry.write_scene(path, ExportScene.of(random_gaussians(20, 1), PLACED))
     assert beside.is_file()
     registry.check_not_foreign(path)
+
+
+@pytest.mark.parametrize("code", ["EPSG:32611", "EPSG:32633+5773"])
+def test_a_coordinate_system_of_a_ply_that_was_deleted_is_still_ours(tmp_path, code):
+    pyproj = pytest.importorskip("pyproj")
+    crs, path, beside = pyproj.CRS.from_user_input(code), tmp_path / "a.ply", tmp_path / "a.ply.prj"
+    registry.write_scene(path, ExportScene.of(random_gaussians(20, 1), replace(PLACED, crs=crs.to_wkt())))
+    path.unlink()
+    registry.check_not_foreign(path)
+    for theirs in ("WKT1_ESRI", "WKT1_GDAL"):
+        beside.write_text(crs.to_wkt(theirs) + "\n")
+        with pytest.raises(VdgsError, match=r"\.prj: is there already and was not written by vdgs"):
+            registry.check_not_foreign(path)
 
 
 def test_scenes_that_are_not_what_they_announce_are_refused(tmp_path):

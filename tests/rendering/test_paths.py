@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from support.captures import TinyScene, write_colmap
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
@@ -266,6 +267,31 @@ def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
         assert camera.position[0] == pytest.approx(x)
 
 
+@pytest.mark.parametrize(("text", "given"), [(True, ""), (True, "images.txt"), (False, ""), (False, "images.bin")])
+def test_the_images_of_a_colmap_model_are_a_path(tmp_path: Path, text: bool, given: str):
+    """In order of their names, in the world of the capture, without distortion, all of one size."""
+    poses = {f"DJI_{k}.jpg": standing([float(k), 0, 9], [float(k), 5, 0], fx=300.0 + k) for k in (10, 1, 2)}
+    poses["DJI_10.jpg"] = replace(poses["DJI_10.jpg"], width=640, height=360, fx=620.0, fy=820.0, cx=320.0, cy=180.0)
+    folder = write_colmap(
+        tmp_path, TinyScene(poses, np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), text=text, images=None,
+        model="OPENCV", extra=(0.1, -0.05, 0.0, 0.0),
+    )  # fmt: skip
+    ground = GroundFrame(
+        scale=2.0, rotation=np.eye(3), translation=np.array([1.0, 0, 0]), metric=False, description="test"
+    )
+    path = load_path(folder / given, TEMPLATE, ground)
+    places = [camera.position for camera in path.cameras]
+    np.testing.assert_allclose(places, [[3, 0, 18], [5, 0, 18], [21, 0, 18]], atol=1e-9)
+    found = [(camera.fx, camera.fy, camera.cx, camera.width, camera.height) for camera in path.cameras]
+    np.testing.assert_allclose(found, [(301, 410, 160, 320, 180), (302, 410, 160, 320, 180), (310, 410, 160, 320, 180)])
+    assert len(load_path(folder / given, TEMPLATE, ground, seconds=2.0, fps=10.0).cameras) == 20
+
+
+def test_a_folder_without_a_colmap_model_is_no_path(tmp_path: Path):
+    with pytest.raises(VdgsError, match="no COLMAP model here"):
+        load_path(tmp_path, TEMPLATE)
+
+
 #: A key frame.
 VIEW = {"position": [0, 0, 1], "look_at": [0, 0, 0]}
 
@@ -303,6 +329,7 @@ def test_the_size_of_a_film_is_what_nerfstudio_reads_not_the_aspect_of_its_frame
         ({"camera_path": [{}]}, "camera_to_world"),
         ({"camera_path": [{"camera_to_world": np.eye(4).tolist()}], "frame": "moon"}, "ground or source"),
         ("path", "list of key frames"),
+        ({"camera_angle_x": 0.8, "frames": [{"transform_matrix": np.eye(4).tolist()}]}, "which is no camera path"),
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "fps": -3}, "fps is -3; it must be"),
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "second": 3}, "did you mean 'seconds'"),
         ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fovdeg": 60}], "key frame 0: there is no 'fovdeg'; did you"),

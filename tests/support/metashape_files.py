@@ -106,15 +106,16 @@ def metashape_rig(flight: TrueFlight, lens: Lens, bands: str = "Red") -> tuple[s
     return xml, TrueFlight(names, rotations, centers, flight.points, lens)
 
 
-def write_project(root: Path, flight: TrueFlight, *, suffix: str = ".psx") -> Path:
-    """A project as the program stores it: a document that points to a folder of zips, or one zip; with tie points."""
+def write_project(root: Path, flight: TrueFlight, *, suffix: str = ".psx", color_kind: str = "u1") -> Path:
+    """A project as the program stores it: a document that points to a folder of zips, or one zip; with tie points,
+    whose colors are of 8 or 16 bits."""
     xml = metashape_xml(flight)
     chunk = xml[xml.index("<chunk") : xml.index("</document>")].replace("<frame id", '<frame path="0/frame.zip" id')
     photos = "".join(
         f'<camera camera_id="{index}"><photo path="../../../{name}"/></camera>'
         for index, name in enumerate(flight.names)
     )
-    lists = _tie_points(flight)
+    lists = _tie_points(flight, color_kind)
     counted = "".join(f'<projections camera_id="{k}" path="p{k}.ply"/>' for k in range(len(flight.names)))
     cloud = f'<point_cloud><tracks path="tracks.ply"/><points path="points0.ply"/>{counted}</point_cloud>'
     head = '<?xml version="1.0" encoding="UTF-8"?>\n'
@@ -134,14 +135,18 @@ def write_project(root: Path, flight: TrueFlight, *, suffix: str = ".psx") -> Pa
     return file
 
 
-def _tie_points(flight: TrueFlight) -> dict[str, bytes]:
+def _tie_points(flight: TrueFlight, color_kind: str) -> dict[str, bytes]:
     """Lists of points in the chunk's coordinates, and of their pixels in each photograph."""
     numbers = np.arange(len(flight.points), dtype="<u4")
     places = chunk_from_enu(flight.points).astype("<f4")
+    steps = np.iinfo(color_kind).max // 255
     lists = {
         "points0.ply": _ply({**dict(zip("xyz", places.T, strict=True)), "id": numbers}),
         "tracks.ply": _ply(
-            {name: np.full(len(numbers), 10 + k, "u1") for k, name in enumerate(("red", "green", "blue"))}
+            {
+                name: np.full(len(numbers), (10 + k) * steps, color_kind)
+                for k, name in enumerate(("red", "green", "blue"))
+            }
         ),
     }
     for index in range(len(flight.names)):
@@ -152,7 +157,7 @@ def _tie_points(flight: TrueFlight) -> dict[str, bytes]:
 
 
 def _ply(columns: dict[str, np.ndarray]) -> bytes:
-    kinds = {"f4": "float", "u4": "uint", "u1": "uchar"}
+    kinds = {"f4": "float", "u4": "uint", "u2": "ushort", "u1": "uchar"}
     listed = "".join(f"property {kinds[column.dtype.str[1:]]} {name}\n" for name, column in columns.items())
     count = len(next(iter(columns.values())))
     records = np.rec.fromarrays(list(columns.values()), names=list(columns))

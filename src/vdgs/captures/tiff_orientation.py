@@ -13,6 +13,8 @@ _HEADS = {
     b"II*\0": ("<", 4, "I", "H", 12), b"MM\0*": (">", 4, "I", "H", 12),
     b"II+\0": ("<", 8, "Q", "Q", 20), b"MM\0+": (">", 8, "Q", "Q", 20),
 }  # fmt: skip
+#: Formats of whole numbers by their TIFF types: BYTE, LONG and LONG8. All others are taken for SHORT.
+_NUMBERS = {1: "B", 4: "I", 16: "Q"}
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
@@ -34,9 +36,10 @@ def without_orientation(data: np.ndarray) -> np.ndarray:
         (entries,) = struct.unpack_from(order + count, data.data, at)
         first = at + struct.calcsize(count)
         for where in range(first, first + entry * min(entries, len(data) // entry), entry):
-            if struct.unpack_from(order + "H", data.data, where)[0] == _ORIENTATION:
+            tag, kind = struct.unpack_from(order + "HH", data.data, where)
+            if tag == _ORIENTATION:
                 upright = data.copy()
-                struct.pack_into(order + "H", upright.data, where + entry - start, 1)
+                struct.pack_into(order + _NUMBERS.get(kind, "H"), upright.data, where + entry - start, 1)
                 return upright
     except struct.error:  # a damaged file, of which decoders tell
         pass

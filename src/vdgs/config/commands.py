@@ -129,7 +129,8 @@ class RenderRequest(ModelRequest):
     views: Literal["test", "train", "orbit", "flyover"] = "test"
     """Which cameras. `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
-    """JSON file with a camera path; overrides --views. Either one exported by nerfstudio's viewer, with the
+    """Camera path; overrides --views. The folder of a COLMAP model in the world of the capture, whose images become the
+    frames in order of their names, or a JSON file: one exported by nerfstudio's viewer, with the
     dataparser_transforms.json of that training beside it, one folder up or in the capture, or
     {"keyframes": [{"position": [x, y, z], "look_at": [x, y, z], "fov_deg": 60}, ...]} in the ground frame; beside it,
     as you like, "frame": "source" (that of the capture's own cameras), "seconds", "fps", "closed", "interpolate". A key

@@ -15,6 +15,7 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import ExportScene, InitialView
 from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, default_crs, make_local_frame
+from vdgs.geometry.ground_frame import UNKNOWN_UNIT
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.decode_world import gaussian_means
 from vdgs.runs.open_run import OpenedRun
@@ -119,15 +120,15 @@ def select_rows(
     """
     rows = {}
     for path, frame in frames.items():
-        reach = registry.format_from_path(path).max_coordinate
-        beyond = ~_is_within_reach(path, frame, means)
+        far, reach = _distances(path, frame, means)
+        beyond = far >= reach
         share = float(pixels[beyond].sum() / pixels.sum())
         if share > MAX_DROPPED_SHARE:
             beyond[:] = False  # it is refused below
         elif beyond.any():
             console.print(
                 f"[yellow]note[/] {path.name}: {np.count_nonzero(beyond):,} of {len(means):,} Gaussians lie more than "
-                f"{reach:.0f} units away, where the format does not reach; they are left out. They make "
+                f"{reach:.4g} units away, where the format does not reach; they are left out. They make "
                 f"{share:.2g} of what the training cameras see.",
                 highlight=False,
             )
@@ -148,12 +149,16 @@ def _unwritten(frame: LocalFrame, count: int, request: ExportRequest, page: Init
 
 def rows_within_reach(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, " r"]:
     """Those that the format of a file can hold."""
-    return np.flatnonzero(_is_within_reach(path, frame, means))
+    far, reach = _distances(path, frame, means)
+    return np.flatnonzero(far < reach)
 
 
-def _is_within_reach(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
-    inside: np.ndarray = (np.abs(_local(frame, means)) < 0.999 * registry.format_from_path(path).max_coordinate).all(1)
-    return inside
+def _distances(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, " m"], float]:
+    """The largest local coordinate of each, and how far the format of a file reaches."""
+    kind, far = registry.format_from_path(path), np.abs(_local(frame, means)).max(1)
+    if kind.reach_in_extents is not None and frame.facts.unit == UNKNOWN_UNIT:
+        return far, kind.reach_in_extents * float(np.quantile(far, 0.99))
+    return far, 0.999 * kind.max_coordinate
 
 
 def _local(frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:

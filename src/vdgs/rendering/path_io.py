@@ -1,4 +1,5 @@
-"""Camera paths from files. JSON, either our own:
+"""Camera paths from files: the images of a COLMAP model in the source frame, one a frame (`colmap_path`); or JSON,
+either our own:
 
     {
       "frame": "ground",              // or "source": the frame of the capture's own cameras
@@ -48,6 +49,7 @@ from vdgs.rendering.camera_paths import (
     look_at_pose,
     pose_from_rotation,
 )
+from vdgs.rendering.colmap_path import is_colmap, read_colmap_path
 from vdgs.rendering.nerfstudio import find_nerfstudio_frame, pose_in_source
 
 #: What our own files may hold.
@@ -84,9 +86,11 @@ def load_path(
     come back in the ground frame (z up). Raises VdgsError naming the file, the key frame and the field, and where
     nerfstudio's frame is not known.
     """
-    content = _read(file)
+    content = {} if is_colmap(file) else _read(file)
     try:
-        if "camera_path" in content:
+        if is_colmap(file):
+            cameras, interpolated, frame = read_colmap_path(file, default), False, "source"
+        elif "camera_path" in content:
             cameras, interpolated, frame = _from_nerfstudio(content, default)
         else:
             cameras, interpolated, frame = _from_keyframes(content, default)
@@ -120,6 +124,11 @@ def _read(file: Path) -> Mapping[str, Any]:
         content = {"keyframes": content}
     if not isinstance(content, Mapping):
         raise VdgsError(f"{file}: a camera path is a list of key frames, or an object with `keyframes`.")
+    if "frames" in content:
+        raise VdgsError(
+            f"{file}: lists photographs and their poses (as transforms.json does), which is no camera path. Write each "
+            "pose as camera_from_world of a key frame, or give the folder of a COLMAP model of them."
+        )
     return content
 
 

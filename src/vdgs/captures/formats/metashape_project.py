@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.formats.ply_reader import GRAY, read_vertices
+from vdgs.captures.formats.ply_reader import GRAY, read_vertices, vertex_colors
 from vdgs.captures.formats.xml_documents import holds, read_xml
 from vdgs.errors import CaptureError
 
@@ -131,11 +131,15 @@ def _read_points(archive: Path, manifest: Element) -> TiePoints:
     try:
         with zipfile.ZipFile(archive) as zipped:
 
-            def vertices(element: Element, *needs: str) -> np.ndarray | None:
+            def table(element: Element, *needs: str) -> tuple[np.ndarray, Mapping[str, str]] | None:
                 name = element.get("path", "")
                 if name not in zipped.namelist() or zipped.getinfo(name).file_size > MAX_BYTES:
                     return None
-                return read_vertices(zipped.read(name), archive, needs)[0]
+                return read_vertices(zipped.read(name), archive, needs)
+
+            def vertices(element: Element, *needs: str) -> np.ndarray | None:
+                read = table(element, *needs)
+                return None if read is None else read[0]
 
             clouds = [vertices(each, "x", "y", "z", "id") for each in manifest.findall("points")]
             known = [cloud for cloud in clouds if cloud is not None]
@@ -145,9 +149,9 @@ def _read_points(archive: Path, manifest: Element) -> TiePoints:
             numbers = np.concatenate([cloud["id"] for cloud in known]).astype(np.int64)
             numbers, first = np.unique(numbers, return_index=True)
             colors = np.full((len(numbers), 3), GRAY, np.uint8)
-            tracks = next((vertices(each, "red", "green", "blue") for each in manifest.findall("tracks")), None)
-            if tracks is not None and len(numbers) and numbers[0] >= 0 and numbers[-1] < len(tracks):
-                colors = np.stack([tracks[name][numbers] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
+            tracks = next((table(each, "red", "green", "blue") for each in manifest.findall("tracks")), None)
+            if tracks is not None and len(numbers) and numbers[0] >= 0 and numbers[-1] < len(tracks[0]):
+                colors = vertex_colors(tracks[0][numbers], tracks[1])
             shown = {}
             for element in manifest.findall("projections"):
                 seen = vertices(element, "x", "y", "id")

@@ -55,7 +55,7 @@ def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     vertices, types = read_vertices(data, file)
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    return points, _colors(vertices, types)
+    return points, vertex_colors(vertices, types)
 
 
 def read_vertices(
@@ -127,7 +127,9 @@ def _too_short(header: _Header, file: Path) -> CaptureError:
     )
 
 
-def _colors(vertices: np.ndarray, types: Mapping[str, str]) -> np.ndarray:
+def vertex_colors(vertices: np.ndarray, types: Mapping[str, str]) -> np.ndarray:
+    """Colors [n, 3] uint8 of vertices as `read_vertices` gives them, of 16 bits and fractions too; mid-gray where there
+    are none."""
     names = {name.lower(): name for name in vertices.dtype.names or ()}
     triple = next((triple for triple in COLORS if set(triple) <= set(names)), None)
     if triple is None:

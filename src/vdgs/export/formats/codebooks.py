@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -12,19 +14,46 @@ SAMPLE_ROWS = 1 << 16
 LLOYD_ITERATIONS = 20
 
 
-def fit_codebook(sample: Float[np.ndarray, " n"], low: float, high: float) -> Float[np.ndarray, "256"]:
-    """256 ascending values with small squared distances to numbers (Lloyd's iteration on sorted numbers), learnt from a
-    sample of them and from the least and the largest of all: the few that the sample lacks are not cut off."""
-    numbers = np.sort(np.append(sample.astype(np.float64), [low, high]))
-    # Half by rank, half by place: crowds are told apart, and what is rare is not rounded far.
+def learn_codebook(
+    sample: Float[np.ndarray, "m *shape"], parts: Iterable[Float[np.ndarray, "n *shape"]]
+) -> Float[np.ndarray, "256"]:
+    """256 ascending values for numbers of which a sample is at hand, and all in parts: those that the codebook of the
+    sample would round farther than any of the sample are learnt from too."""
+    entries = fit_codebook(sample.ravel())
+    worst = _rounding(sample.ravel(), entries).max()
+    missed = [part.ravel()[_rounding(part.ravel(), entries) > worst] for part in parts]
+    return fit_codebook(np.concatenate([sample.ravel(), *missed])) if any(map(len, missed)) else entries
+
+
+def fit_codebook(numbers: Float[np.ndarray, " n"]) -> Float[np.ndarray, "256"]:
+    """256 ascending values with small squared distances to numbers (Lloyd's iteration on sorted numbers). An entry that
+    no number is next to halves the cell with the largest error: voids before the few that are far away hold none."""
+    numbers = np.sort(numbers.astype(np.float64))
+    # Half by rank, half by place: crowds are told apart, and what is rare is not rounded far. A void is two steps.
     ranks = np.quantile(numbers, (np.arange(CODEBOOK_SIZE // 2) + 0.5) / (CODEBOOK_SIZE // 2))
-    entries = np.sort(np.concatenate([ranks, np.linspace(numbers[0], numbers[-1], CODEBOOK_SIZE - len(ranks))]))
+    gaps = np.minimum(np.diff(numbers), 2 * (ranks[-1] - ranks[0]) / len(ranks))
+    along = np.concatenate([[0.0], np.cumsum(gaps)])
+    places = np.interp(np.linspace(0.0, along[-1], CODEBOOK_SIZE - len(ranks)), along, numbers)
+    entries = np.sort(np.concatenate([ranks, places]))
     sums = np.concatenate([[0.0], np.cumsum(numbers)])
     for _ in range(LLOYD_ITERATIONS):
         edges = np.concatenate([[0], np.searchsorted(numbers, (entries[1:] + entries[:-1]) / 2), [len(numbers)]])
         held = np.diff(edges)
         entries = np.where(held > 0, np.diff(sums[edges]) / np.maximum(held, 1), entries)
-    return np.sort(entries).astype(np.float32)
+        cells = np.repeat(np.arange(CODEBOOK_SIZE), held)
+        errors = np.bincount(cells, (numbers - entries[cells]) ** 2, CODEBOOK_SIZE)
+        idle = np.flatnonzero(held == 0)
+        split = np.argsort(-errors, kind="stable")[: min(len(idle), np.count_nonzero(errors))]
+        half = np.sqrt(errors[split] / held[split])
+        entries[idle[: len(split)]] = entries[split] + half
+        entries[split] -= half
+        entries.sort()
+    return entries.astype(np.float32)
+
+
+def _rounding(numbers: Float[np.ndarray, " n"], entries: Float[np.ndarray, "256"]) -> Float[np.ndarray, " n"]:
+    distances: np.ndarray = np.abs(numbers - entries[quantize(numbers, entries)])
+    return distances
 
 
 def quantize(values: Float[np.ndarray, "*shape"], entries: Float[np.ndarray, "256"]) -> np.ndarray:

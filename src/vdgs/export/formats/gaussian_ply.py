@@ -71,6 +71,21 @@ def write_crs_beside(path: Path, facts: ExportMetadata) -> None:
         beside_ply(path).unlink(missing_ok=True)
 
 
+def reads_as_written_beside(file: Path) -> bool:
+    """Whether a FILE.prj is such as `write_crs_beside` writes: to the letter what pyproj says of a system, on one line.
+    It names no program, and is left where people delete a PLY."""
+    try:
+        from pyproj import CRS
+        from pyproj.exceptions import CRSError
+    except ImportError:
+        return False
+    try:
+        text = file.read_text("utf-8")
+        return text == CRS.from_wkt(text).to_wkt() + "\n"
+    except (CRSError, OSError, UnicodeDecodeError):
+        return False
+
+
 def write_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
     """Write the scene, atomically; loses nothing. Raises VdgsError."""
     names = property_names(scene.degree)

@@ -59,14 +59,14 @@ class GaussianStore:
         if len(rows):
             self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
 
-    def value_range(self) -> tuple[Gaussians, Gaussians]:
-        """The least and the largest value of each number of all Gaussians, as one Gaussian each."""
-        low = high = np.array(self.table[:1])
+    def values(self, name: str) -> Iterator[Float[np.ndarray, "b *shape"]]:
+        """One quantity of all Gaussians, some thousand at a time."""
+        widths = {each: math.prod(shape) for each, shape in self.shapes.items()}
+        start = sum(widths[each] for each in list(widths)[: list(widths).index(name)])
         for first in range(0, len(self.table), CHUNK_SIZE):
-            part = self.table[first : first + CHUNK_SIZE]
-            low, high = np.minimum(low, part.min(0)), np.maximum(high, part.max(0))
+            part = np.array(self.table[first : first + CHUNK_SIZE, start : start + widths[name]])
+            yield part.reshape(-1, *self.shapes[name])
             self.release_pages()
-        return _unflatten(torch.from_numpy(low), self.shapes), _unflatten(torch.from_numpy(high), self.shapes)
 
     def release_pages(self) -> None:
         """Leave to the system which pages of the file lie in memory. They do not count as this process' own then, and

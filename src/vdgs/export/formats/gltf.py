@@ -1,7 +1,8 @@
 """glTF: one GLB of points that viewers with KHR_gaussian_splatting draw as Gaussians, and others as colored points.
 
-Every number is kept as float32. glTF's y is up: positions, rotations and spherical harmonics are turned there. The
-second kind, `spz_glb`, holds an SPZ in their place (KHR_gaussian_splatting_compression_spz_2): what 3D Tiles need.
+Every number of a Gaussian is kept as float32. glTF's y is up: positions, rotations and spherical harmonics are turned
+there. The second kind, `spz_glb`, holds an SPZ in their place (KHR_gaussian_splatting_compression_spz_2): what 3D Tiles
+need.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from vdgs.export.formats.export_scene import (
     base_colors,
     gaussian_scales,
     opacities,
-    to_uint8,
 )
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic, write_values
@@ -31,7 +31,9 @@ from vdgs.system.documents import JsonObject
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
-GL_FLOAT, GL_UNSIGNED_BYTE = 5126, 5121
+GL_FLOAT, GL_UNSIGNED_BYTE, GL_UNSIGNED_SHORT = 5126, 5121, 5123
+#: Bytes of a number; whole ones stand for 0 to 1.
+COMPONENT_BYTES = {GL_FLOAT: 4, GL_UNSIGNED_BYTE: 1, GL_UNSIGNED_SHORT: 2}
 #: Lengths in a GLB are of 32 bits.
 MAX_LENGTH = 2**32 - 1
 #: What the JSON grows by at most once the bounds of the positions are known.
@@ -49,10 +51,10 @@ class VertexAttribute:
 
     @property
     def bytes_per_gaussian(self) -> int:
-        return self.width * (4 if self.component == GL_FLOAT else 1)
+        return self.width * COMPONENT_BYTES[self.component]
 
     def accessor(self, count: int) -> JsonObject:
-        normalized = {"normalized": True} if self.component == GL_UNSIGNED_BYTE else {}
+        normalized = {} if self.component == GL_FLOAT else {"normalized": True}
         return {"componentType": self.component, "count": count, "type": self.accessor_type, **normalized}
 
 
@@ -61,7 +63,7 @@ def vertex_attributes(degree: int) -> list[VertexAttribute]:
     bands = [(band, index) for band in range(degree + 1) for index in range(2 * band + 1)]
     return [
         VertexAttribute("POSITION", "VEC3", GL_FLOAT, 3),
-        VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_BYTE, 4),
+        VertexAttribute("COLOR_0", "VEC4", GL_UNSIGNED_SHORT, 4),
         VertexAttribute(f"{EXTENSION}:ROTATION", "VEC4", GL_FLOAT, 4),
         VertexAttribute(f"{EXTENSION}:SCALE", "VEC3", GL_FLOAT, 3),
         VertexAttribute(f"{EXTENSION}:OPACITY", "SCALAR", GL_FLOAT, 1),
@@ -112,13 +114,21 @@ def write_glb(path: Path, scene: ExportScene) -> tuple[str, ...]:
 def _values(piece: Gaussians) -> Iterator[np.ndarray]:
     """The numbers of the columns, in their order."""
     yield piece.means.numpy()
-    yield to_uint8(np.concatenate([base_colors(piece), opacities(piece)[:, None]], 1))
+    shown = np.concatenate([_linear(base_colors(piece).clip(0, 1)), opacities(piece)[:, None]], 1)
+    yield np.rint(shown * 65535).astype(np.uint16)
     yield piece.quaternions.numpy()[:, [1, 2, 3, 0]]
     yield gaussian_scales(piece)
     yield opacities(piece)
     yield piece.sh0.numpy()
     for index in range(piece.shN.shape[1]):
         yield np.ascontiguousarray(piece.shN[:, index].numpy())
+
+
+def _linear(values: np.ndarray) -> np.ndarray:
+    """Light of sRGB values in 0 .. 1. COLOR_0 is linear in all of glTF, whatever the space of the harmonics; it has 16
+    bits, for 8 would round dark colors far."""
+    light: np.ndarray = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return light
 
 
 def _document(

@@ -38,6 +38,8 @@ LAS_SCALE = 0.001
 LAS_RANGE = 2**31
 #: Coordinates of a known unit lie below this, from the origin.
 MAX_LAS_COORDINATE = LAS_RANGE * LAS_SCALE
+#: Those of an unknown unit below so many times what nearly all of the scene reaches: steps stay fine beside it.
+LAS_REACH_IN_EXTENTS = 2000.0
 LOSS_NOTES = ("sizes, rotations and changing colors are left out: these are points",)
 
 

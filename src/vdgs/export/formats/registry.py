@@ -11,10 +11,16 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
 from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate, metadata_path
 from vdgs.export.formats.file_folders import FileFolder
-from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, write_ply
+from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, reads_as_written_beside, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_page, html_capacity, read_html_chunks, write_html
-from vdgs.export.formats.point_cloud import MAX_LAS_COORDINATE, check_las, write_laz, write_points
+from vdgs.export.formats.point_cloud import (
+    LAS_REACH_IN_EXTENTS,
+    MAX_LAS_COORDINATE,
+    check_las,
+    write_laz,
+    write_points,
+)
 from vdgs.export.formats.rad import write_rad
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import read_splat_chunks, write_splat
@@ -48,6 +54,8 @@ class ExportFormat:
     facts_file: Callable[[Path], Path] | None = None
     #: Coordinates lie below this, from the origin.
     max_coordinate: float = math.inf
+    #: Where their unit is unknown: below so many times what 99 of 100 Gaussians reach. None: no such distinction.
+    reach_in_extents: float | None = None
     #: Whether its colors do not change with the direction: best baked so, where all files are of that kind.
     fixed_colors: bool = False
     #: Whether it holds points without shapes, which stand where a map has them exactly.
@@ -176,6 +184,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_laz,
         check=check_las,
         max_coordinate=MAX_LAS_COORDINATE,
+        reach_in_extents=LAS_REACH_IN_EXTENTS,
         facts_file=metadata_path,
         only_points=True,
     ),
@@ -185,6 +194,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         write=write_laz,
         check=check_las,
         max_coordinate=MAX_LAS_COORDINATE,
+        reach_in_extents=LAS_REACH_IN_EXTENTS,
         facts_file=metadata_path,
         only_points=True,
     ),
@@ -209,7 +219,9 @@ def check_not_foreign(path: Path) -> None:
     if chosen.facts_file is metadata_path:
         check_ours(metadata_path(path))
     elif chosen.facts_file is not None:
-        check_ours(chosen.facts_file(path), path)  # names no program: it is ours beside a file of ours
+        beside = chosen.facts_file(path)  # names no program: it is ours beside a file of ours
+        if not (beside.is_file() and reads_as_written_beside(beside)):
+            check_ours(beside, path)
 
 
 def check_ours(path: Path, *beside: Path) -> None:

@@ -17,10 +17,9 @@ import numpy as np
 import torch
 from jaxtyping import Int
 from PIL import Image
-from torch import Tensor
 
 from vdgs.export.formats.axes import Y_DOWN
-from vdgs.export.formats.codebooks import SAMPLE_ROWS, VectorCodebook, fit_codebook, quantize
+from vdgs.export.formats.codebooks import SAMPLE_ROWS, VectorCodebook, fit_codebook, learn_codebook, quantize
 from vdgs.export.formats.export_scene import (
     CHUNK_SIZE,
     ExportMetadata,
@@ -90,12 +89,10 @@ class _Images:
         sample = scene.sample(SAMPLE_ROWS)
         self.count, self.degree = len(scene.means), sample.sh_degree
         self.low, self.high = _signed_log(scene.means.min(0)), _signed_log(scene.means.max(0))
-        least, most = scene.value_range()
-        self.scales = _codebook(sample.log_scales, least.log_scales, most.log_scales)
-        self.colors = _codebook(sample.sh0, least.sh0, most.sh0)
+        self.scales = learn_codebook(sample.log_scales.numpy(), scene.values("log_scales"))
+        self.colors = learn_codebook(sample.sh0.numpy(), scene.values("sh0"))
         if self.palette:
-            rows = self.palette.rows
-            self.harmonics = fit_codebook(rows.ravel(), float(rows.min()), float(rows.max()))
+            self.harmonics = fit_codebook(self.palette.rows.ravel())
 
     def max_step(self) -> float:
         """The largest step between neighboring positions, in units of the scene."""
@@ -157,11 +154,6 @@ class _Images:
                 "files": ["shN_centroids.webp", "shN_labels.webp"],
             }  # fmt: skip
         return meta
-
-
-def _codebook(sample: Tensor, least: Tensor, most: Tensor) -> np.ndarray:
-    """The entries for numbers of Gaussians, by a sample and the least and largest of all, axis by axis."""
-    return fit_codebook(sample.numpy().ravel(), float(least.min()), float(most.max()))
 
 
 def _signed_log(positions: np.ndarray) -> np.ndarray:
