@@ -187,11 +187,23 @@ def _some(names: list[str]) -> str:
 
 
 def require_trainable(capture: Capture, console: Console) -> None:
-    """Say what is doubtful about a capture and what masks leave out. Raises `CaptureError` for one that cannot become a
-    scene, and for photographs or masks that are damaged."""
+    """Say what is doubtful about a capture and what masks leave out. Raises as `find_doubts`."""
+    print_doubts(find_doubts(capture), console)
+
+
+def find_doubts(capture: Capture) -> list[str]:
+    """What is doubtful about a capture and what masks leave out, as lines for a console; decodes all photographs.
+
+    Raises `CaptureError` for one that cannot become a scene, and for photographs or masks that are damaged.
+    """
     soundness = require_valid(capture)
     checked = check_images(capture)
-    for warning in (*capture.warnings, *soundness.warnings, *checked.warnings):
-        console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
-    if checked.masked_fraction:
-        console.print(f"masks leave out {checked.masked_fraction:.1%} of the photographs", highlight=False)
+    warnings = (*capture.warnings, *soundness.warnings, *checked.warnings)
+    lines = [f"[yellow]note[/] {escape(warning)}" for warning in warnings]
+    masked = checked.masked_fraction
+    return lines + ([f"masks leave out {masked:.1%} of the photographs"] if masked else [])
+
+
+def print_doubts(lines: Sequence[str], console: Console) -> None:
+    for line in lines:
+        console.print(line, highlight=False)
