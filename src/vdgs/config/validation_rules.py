@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from vdgs.config.method import DensifyConfig, MethodConfig, ResolutionSchedule
 from vdgs.config.ranges import find_range_errors, iter_out_of_range, range_missed
 from vdgs.config.serialization import from_dict, read_value
+from vdgs.config.type_hints import field_hints
+from vdgs.config.typed_paths import holds_path, home_path
 from vdgs.errors import VdgsError
 
 S = TypeVar("S")
@@ -37,8 +40,13 @@ def checked_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
     Raises VdgsError, in the names of the fields, for an unknown one, a value of another type and a number outside its
     range.
     """
+    hints = field_hints(kind)
+    given = {
+        name: str(home_path(value)) if isinstance(value, (str, Path)) and holds_path(hints.get(name)) else value
+        for name, value in values.items()
+    }
     try:
-        settings: S = from_dict(kind, values, where, numeric_text=False)
+        settings: S = from_dict(kind, given, where, numeric_text=False)
     except ValueError as error:
         raise VdgsError(str(error)) from error
     wrong = next(iter_out_of_range(settings, (where,)), None)
