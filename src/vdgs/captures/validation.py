@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -191,13 +192,14 @@ def require_trainable(capture: Capture, console: Console) -> None:
     print_doubts(find_doubts(capture), console)
 
 
-def find_doubts(capture: Capture) -> list[str]:
-    """What is doubtful about a capture and what masks leave out, as lines for a console; decodes all photographs.
+def find_doubts(capture: Capture, sample: Literal["all"] | int = "all") -> list[str]:
+    """What is doubtful about a capture and what masks leave out, as lines for a console; decodes all photographs, or a
+    sample of so many.
 
     Raises `CaptureError` for one that cannot become a scene, and for photographs or masks that are damaged.
     """
     soundness = require_valid(capture)
-    checked = check_images(capture)
+    checked = check_images(capture, sample)
     warnings = (*capture.warnings, *soundness.warnings, *checked.warnings)
     lines = [f"[yellow]note[/] {escape(warning)}" for warning in warnings]
     masked = checked.masked_fraction
