@@ -40,19 +40,23 @@ def checked_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
     Raises VdgsError, in the names of the fields, for an unknown one, a value of another type and a number outside its
     range.
     """
-    hints = field_hints(kind)
-    given = {
-        name: str(home_path(value)) if isinstance(value, (str, Path)) and holds_path(hints.get(name)) else value
-        for name, value in values.items()
-    }
     try:
-        settings: S = from_dict(kind, given, where, numeric_text=False)
+        settings: S = from_dict(kind, _with_homes(kind, values), where, numeric_text=False)
     except ValueError as error:
         raise VdgsError(str(error)) from error
     wrong = next(iter_out_of_range(settings, (where,)), None)
     if wrong is not None:
         raise VdgsError(f"{'.'.join(wrong.path)} is {wrong.value}; it must be {wrong.range}")
     return settings
+
+
+def _with_homes(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with the whole paths of home folders that paths among them begin with."""
+    hints = field_hints(kind)
+    return {
+        name: str(home_path(value)) if isinstance(value, (str, Path)) and holds_path(hints.get(name)) else value
+        for name, value in values.items()
+    }
 
 
 def checked_value(name: str, value: Any, hint: Any) -> Any:
