@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.captures.capture_metadata import capture_fingerprint, capture_metadata, check_same_capture
+from vdgs.captures.capture_metadata import MASK_CONTENTS, capture_fingerprint, capture_metadata, check_same_capture
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import RunError
@@ -44,3 +44,23 @@ def test_masks_that_are_added_edited_or_removed_make_another_capture(tmp_path):
         check_same_capture(tmp_path / "capture.json", masked, read())
     check_same_capture(tmp_path / "capture.json", plain, read())
     assert "masks" not in capture_fingerprint(read())
+
+
+@pytest.mark.parametrize("scale", [1, 30])  # small, and larger than what is read whole
+def test_a_mask_that_is_edited_to_the_same_size_makes_another_capture(tmp_path, scale):
+    def read():
+        return load_capture(tmp_path, CaptureOptions())
+
+    write_colmap(tmp_path, tiny_scene(width=64, height=48))
+    file, mask = tmp_path / "masks" / "frame_005.png", np.full((48 * scale, 64 * scale), 255, np.uint8)
+    file.parent.mkdir()
+    write = lambda: cv2.imwrite(str(file), mask, (cv2.IMWRITE_PNG_COMPRESSION, 0))  # noqa: E731
+    write()
+    before, size = capture_metadata(read()), file.stat().st_size
+    older = before | {"fingerprint": {k: v for k, v in before["fingerprint"].items() if k != MASK_CONTENTS}}
+    mask[20 * scale : 23 * scale, 10 * scale : 12 * scale] = 0
+    write()
+    assert file.stat().st_size == size
+    with pytest.raises(RunError, match=r"changed: masks\. Restore"):
+        check_same_capture(tmp_path / "capture.json", before, read())
+    check_same_capture(tmp_path / "capture.json", older, read())  # a run of before tells no contents

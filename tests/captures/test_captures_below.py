@@ -11,6 +11,8 @@ import pytest
 from support.advice import advised_words
 from support.captures import TinyScene, write_colmap, write_images
 from support.dataset_layouts import halves, write_matrixcity, write_transforms
+from support.metashape_files import metashape_xml
+from support.true_flight import true_flight
 from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import model_below
 from vdgs.config.capture_options import CaptureOptions
@@ -81,6 +83,20 @@ def test_photographs_in_two_folders_beside_transforms_are_found_by_the_folder_ab
     root, options = follow(model_below(tmp_path))
     assert options.images == str(tmp_path / "photographs")
     assert len(load_capture(root, options).views) == 12
+
+
+@pytest.mark.parametrize("other", ["project", "capture"])
+def test_a_project_beside_another_is_named_with_its_own_photographs(tmp_path, scene, other):
+    for name in ("north", "south"):
+        write_images(tmp_path / name / "photos", scene)
+    for name in ("north", "south") if other == "project" else ("north",):
+        (tmp_path / name / "cameras.xml").write_text(metashape_xml(true_flight()), encoding="utf-8")
+    if other == "capture":
+        write_colmap(tmp_path / "south", scene)
+    said = model_below(tmp_path)
+    assert said is not None
+    assert said.endswith("(beside it: south; a run is of one)")
+    assert f"vdgs run {tmp_path / 'north/cameras.xml'} --output RUN" in said
 
 
 def test_parts_of_a_divided_project_are_all_named(tmp_path, scene):

@@ -275,3 +275,17 @@ def test_a_terminal_without_width_is_printed_to(monkeypatch):
     with pytest.raises(SystemExit):
         main(["status", "nowhere"])
     assert "COLUMNS" not in os.environ
+
+
+def test_a_folder_that_is_too_long_for_sockets_is_refused_where_no_short_one_is(tmp_path, monkeypatch):
+    from vdgs.distributed import ray_executor
+
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / ("long" * 30)))
+    with ray_executor._socket_folder("local") as options:
+        assert Path(options["_temp_dir"]).is_dir()
+    monkeypatch.setattr(ray_executor, "SHORT_FOLDER", str(tmp_path / "none"))
+    refused = ray_executor._socket_folder("local")
+    with pytest.raises(VdgsError, match=r"is too long for the sockets of Ray.*Set RAY_TMPDIR to a folder"), refused:
+        pytest.fail("Ray is started")
+    with ray_executor._socket_folder("10.0.0.1:6379") as options:  # a cluster has its own
+        assert options == {}

@@ -16,6 +16,7 @@ import pytest
 
 from support.commands import PATIENCE_SECONDS
 from support.small_pipeline import NativeRun, vdgs
+from vdgs.captures.reconstruction import read_digests
 from vdgs.cli.argument_parser import parse_words
 from vdgs.cli.main import COMMANDS, main, verb_arguments
 from vdgs.config.capture_options import CaptureOptions
@@ -23,6 +24,7 @@ from vdgs.config.commands import RunRequest
 from vdgs.config.method import MergeConfig
 from vdgs.pipeline.finished_run import _input_times, nothing_to_do
 from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.source_images import SourceFile, SourceImages
 from vdgs.system.atomic_files import write_json
 from vdgs.system.similar_paths import suggest_path
 
@@ -45,6 +47,7 @@ MISTYPED = {
 #: Command lines one after the other in one process: exit code, output, errors, and what heavy is imported after each.
 ANSWERS = """\
 import contextlib, io, json, sys
+from vdgs.captures.reconstruction import read_digests
 from vdgs.cli.main import main
 commands, heavy = json.loads(sys.argv[1])
 answers = []
@@ -215,7 +218,10 @@ def test_photographs_that_lie_elsewhere_are_looked_at_too(native_small: NativeRu
         (capture / "images").symlink_to(card)
         (card / "around").symlink_to(tmp_path)
     cameras = json.loads((run / "cameras.json").read_text())
-    write_json(run / "cameras.json", cameras | {"input_folders": [str(card)] if where != "linked folder" else []})
+    if where == "folder of a project":
+        views = [view | {"file": str(card / Path(view["file"]).name)} for view in cameras["views"]]
+        cameras |= {"input_folders": [str(card)], "views": views}
+    write_json(run / "cameras.json", cameras)
     own = RunFolder(run).settings()
     asked = RunRequest(capture=capture, output=run, ortho=False, options=own.capture, **vars(own.method))
     vdgs("report", run)
@@ -254,6 +260,39 @@ def test_a_run_beside_photographs_is_none_of_them(native_small: NativeRun, tmp_p
     assert nothing_to_do(asked, "").startswith("nothing to do")
     Path(photographs[0]).rename(place / "renamed.png")
     assert nothing_to_do(asked, "") == ""
+
+
+@pytest.mark.parametrize("run_is_of", ["photographs", "a capture"])
+def test_a_photograph_that_is_removed_beside_the_run_is_missed(native_small: NativeRun, tmp_path, run_is_of):
+    """The run lies among what it was made of, where the time of the folder tells nothing."""
+    place = shutil.copytree(native_small.capture, tmp_path / "DCIM")
+    photographs = [Path(shutil.copy(file, place)) for file in sorted((place / "images").iterdir())]
+    run = RunFolder(shutil.copytree(native_small.whole, place / "run"))
+    own, command = run.settings(), "vdgs run DCIM --output DCIM/run"
+    if run_is_of == "photographs":
+        digests = read_digests(run.own_capture)
+        gone = Path(shutil.copy(photographs[0], place / "of before.png"))
+        gone.write_bytes(b"another")
+        digests.of(gone)
+        gone.unlink()
+        files = tuple(SourceFile(file.name, digests.of(file)) for file in photographs)
+        SourceImages(folders=(str(place),), files=files, command=command).write(run.own_capture)
+        digests.write()
+        run.config.write(own, command)
+    else:
+        run.move_capture(place)
+        cameras = json.loads(run.cameras_file.read_text())
+        views = [view | {"file": Path(view["file"]).name} for view in cameras["views"]]
+        write_json(run.cameras_file, cameras | {"input_folders": ["."], "views": views})
+        own = run.settings()
+    asked = RunRequest(capture=place, output=run.path, ortho=False, options=own.capture, **vars(own.method))
+    for file in place.rglob("*"):
+        set_time(file, -200)
+    run.capture_file.touch()
+    vdgs("report", run.path)
+    assert nothing_to_do(asked, command).startswith("nothing to do")
+    photographs[0].unlink()
+    assert nothing_to_do(asked, command) == ""
 
 
 def test_a_folder_that_an_option_names_is_looked_at_with_all_below(tmp_path):

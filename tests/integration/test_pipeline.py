@@ -220,6 +220,7 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_pa
         assert "stereo" not in planned.stdout  # sparse points suffice
     changed = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run")
     assert "changed --lambda-vis: 1.0 -> 0.0" in changed.stdout
+    assert "these make 2 blocks useless, so that the run is refused without --overwrite" in changed.stdout
     assert changed.stdout.count("done already") == 1
     shrunk = vdgs("run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run")
     assert "changed --downscale: 1.0 -> 2.0" in shrunk.stdout, shrunk.stderr

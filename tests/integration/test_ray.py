@@ -61,8 +61,11 @@ def another_code() -> None:
     node_check.code_digest = lambda: "of this machine"  # type: ignore[assignment]
 
 
-def test_a_run_starts_a_ray_of_its_own_for_each_job():
-    """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
+def test_a_run_starts_a_ray_of_its_own_for_each_job(tmp_path):
+    """One after the other, in one process, as `vdgs run --executor ray` does without an address; where the folder of
+    temporary files is too long for sockets too."""
+    long = tmp_path / ("long" * 30)
+    long.mkdir()
     done = python(
         f"""
 from support.ray_agents import wait_for_nodes
@@ -77,6 +80,7 @@ for _ in range(2):
         print(len(ray_executor.list_nodes()), "node")
 """,
         **QUICK_STARTS,
+        TMPDIR=str(long),
     )
     assert done.stdout.splitlines() == ["1 node", "1 node"], done.stderr
 

@@ -451,3 +451,22 @@ def test_wrong_kinds_of_arguments_are_named(capture, coarse):
     ):
         with pytest.raises(TypeError, match=name):
             call()
+
+
+def test_a_path_may_begin_with_the_home_folder(run, native_small, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    for name, place in (("run", native_small.whole), ("capture", native_small.capture)):
+        (tmp_path / name).symlink_to(place)
+    (tmp_path / "tests.txt").write_text(vdgs.load_capture("~/capture").views[0].name)
+    opened = vdgs.load_capture(Path("~/capture"), test_list="~/tests.txt")
+    assert len(opened.test_views) == 1
+    assert vdgs.open_run("~/run").path == tmp_path / "run"
+    run.scene.save("~/scene.safetensors")
+    assert len(vdgs.Scene.load("~/scene.safetensors")) == len(run.scene)
+    vdgs.export(vdgs.Scene(run.scene.model, opened), "~/scene.points.ply")
+    assert (tmp_path / "scene.points.ply").is_file()
+    options = vdgs.CaptureOptions(test_list=Path("~/tests.txt"))
+    with pytest.raises(VdgsError, match="other settings"):  # of the run in ~, not of one in ./~
+        vdgs.train("~/capture", run_dir="~/run", capture_options=options)
+    assert not (tmp_path / "~").exists()

@@ -30,6 +30,7 @@ from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.runs.create_or_resume import create_or_resume_run, exclusive_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
+from vdgs.sfm.discarding import discard_training
 from vdgs.sfm.reconstruct import writing
 from vdgs.system.atomic_files import write_json
 
@@ -140,6 +141,7 @@ def test_what_blocks_at_work_need_is_not_discarded_for_another_capture(run, shar
         pytest.fail("photographs are reconstructed")
     assert contents(run) == before
     with writing(request, run):
+        discard_training(request.output, run)
         assert not run.block(0).has_output()
 
 
@@ -193,3 +195,14 @@ def test_a_run_among_other_files_leaves_nothing_there(place, tmp_path):
     with pytest.raises(RunError, match="holds other files"):
         create_or_resume_run(place, thesis.parent, CaptureOptions(), PRESETS["laptop"])
     assert list(thesis.parent.iterdir()) == [thesis]
+
+
+@pytest.mark.parametrize("options", [("--iterations", "50"), ("--downscale", "2"), ("--block.iterations", "7")])
+def test_what_was_trained_stays_where_the_new_command_is_refused(run, place, capsys, options):
+    """A photograph is damaged, which is known once all are read: by then nothing of the run is changed."""
+    photograph = sorted((place / "images").iterdir())[0]
+    photograph.write_bytes(bytes(photograph.stat().st_size))
+    before = contents(run)
+    assert command_line("run", place, "--output", run.path, *OPTIONS, *options, "--overwrite", "--quiet") == 1
+    assert photograph.name in capsys.readouterr().err
+    assert contents(run) == before

@@ -18,7 +18,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import LossConfig, block_train_config
 from vdgs.config.presets import PRESETS
-from vdgs.errors import Interrupted
+from vdgs.errors import CaptureError, Interrupted, VdgsError
 from vdgs.pipeline import dry_run, image_size, run_estimate, time_estimate
 from vdgs.pipeline.image_size import ImageSize, choose_image_size, image_sizes, largest_suitable
 from vdgs.pipeline.time_estimate import Growth, StepTimes, measure_textures
@@ -201,6 +201,30 @@ def test_the_choice_and_the_dry_run_have_one_estimate(capture, tmp_path, monkeyp
     assert leveled.anchors == pytest.approx(1.7 * plain.anchors, abs=1)
     assert leveled.coarse_bytes > plain.coarse_bytes
     assert leveled.times["coarse"].seconds == pytest.approx(1.1 * plain.times["coarse"].seconds)
+
+
+def test_a_dry_run_refuses_and_tells_what_the_run_would(tmp_path, monkeypatch, capsys):
+    """Photographs that are damaged, points in one place, an output among the photographs; at the cost of a sample."""
+    place, scene = tmp_path / "capture", tiny_scene(points=60)
+    write_colmap(place, scene)
+    asked = request(place, tmp_path / "run", images="images")
+    monkeypatch.setattr(dry_run, "estimate_capture", lambda *_: None)
+    monkeypatch.setattr(dry_run, "_print_estimate", lambda *_: None)
+    monkeypatch.setattr(dry_run, "SAMPLE", 4)
+    dry_run.estimate_run(asked, make_console())
+    said = capsys.readouterr().out
+    assert f"4 of {len(scene.cameras)} photographs were decoded; the run decodes all" in said
+    with pytest.raises(VdgsError, match="Nothing was written"):
+        dry_run.estimate_run(replace(asked, output=place / "images" / "run"), make_console())
+    photographs = sorted((place / "images").iterdir())
+    whole = photographs[0].read_bytes()
+    photographs[0].write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CaptureError, match=rf"(?s)cannot be used.*{photographs[0].name}"):
+        dry_run.estimate_run(asked, make_console())
+    photographs[0].write_bytes(whole)
+    write_colmap(place, replace(scene, points=np.repeat(scene.points[:1], 60, axis=0)))
+    with pytest.raises(CaptureError, match="cannot become a scene"):
+        dry_run.estimate_run(asked, make_console())
 
 
 @pytest.mark.parametrize(("seconds", "size"), [(6000.0, 800), (24000.0, 400)])

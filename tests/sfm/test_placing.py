@@ -19,7 +19,7 @@ pytest.importorskip("embreex")
 from support.flights import ORIGIN, Flight, copy_folder, sightings, unestimated, write_photograph
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import is_capture
-from vdgs.captures.reconstruction import MAPPED, read_reconstruction, report_rows
+from vdgs.captures.reconstruction import MAPPED, is_finished, read_reconstruction, report_rows
 from vdgs.captures.validation import validate_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
@@ -31,6 +31,7 @@ from vdgs.pipeline import dry_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.sfm import feature_extraction, feature_matching, gps_priors, incremental_mapper, scale_bars, workspace
+from vdgs.sfm import reconstruct as reconstruction
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.system.atomic_files import write_json
@@ -153,6 +154,33 @@ def test_what_was_trained_is_deleted_only_once_the_new_place_is_not_refused(nine
     right = table(tmp_path / "gps.csv", nine, lambda enu: enu + 1)
     reconstruct(replace(request, gps=right), console(), run, "vdgs run --gps gps.csv")
     assert not run.is_trained
+
+
+def test_what_was_trained_stays_until_another_capture_takes_its_place(nine, capture, tmp_path, monkeypatch):
+    shutil.copytree(capture, tmp_path / "run" / "capture", symlinks=True)
+    run, same = RunFolder(tmp_path / "run"), SfmRequest(image_folders=(nine.folder,), output=capture, threads=1)
+    same = replace(same, output=run.own_capture)
+    anew = replace(same, options=SfmOptions(max_output_size=200))
+    write_json(run.capture_file, {})  # as training leaves it
+
+    def refuse(*_):
+        raise CaptureError("no scene can be made of these")
+
+    monkeypatch.setattr(reconstruction, "_features", refuse)
+    monkeypatch.setattr(reconstruction, "estimate_sfm", unestimated)
+    for request in (replace(anew, overwrite=True), anew):  # the same command goes on, whose --overwrite is not kept
+        with pytest.raises(CaptureError, match="no scene"):
+            reconstruct(request, console(), run)
+    assert run.is_trained
+    assert load_capture(run.own_capture).views
+    assert not is_finished(run.own_capture)
+    with pytest.raises(RunError, match="Add --overwrite"):
+        reconstruct(replace(anew, options=SfmOptions(max_output_size=300)), console(), run)
+    reconstruct(same, console(), run)  # it is there as it was
+    assert run.is_trained
+    assert is_finished(run.own_capture)
+    with pytest.raises(RunError, match="Add --overwrite"):
+        reconstruct(anew, console(), run)
 
 
 def test_a_look_says_what_is_left_and_refuses_what_the_work_refuses(nine, capture, tmp_path, monkeypatch):

@@ -129,7 +129,8 @@ def model_below(root: Path) -> str | None:
     first = next((each for each in found if each[1] != "model"), found[0])
     alike = [folder for folder, kind in found if kind == first[1]]
     best = first[0] if first[1] == "project" else max(alike, key=_size)
-    others = [folder.relative_to(root).as_posix() for folder in alike if folder != best]
+    beside = [folder for folder, kind in found if (kind == "model") == (first[1] == "model") and folder != best]
+    others = [folder.relative_to(root).as_posix() for folder in beside]
     return _SAID[first[1]](root, best) + (f" (beside it: {first_names(others)}; a run is of one)" if others else "")
 
 
@@ -153,8 +154,7 @@ def _size(folder: Path) -> int:
 
 def _say_of_project(root: Path, folder: Path) -> str:
     name, file = next(find_projects(folder))
-    own = capture_root(file) / "images"
-    images = "" if own.is_dir() and _count_images(own, True) else f" --images {shell_word(root)}"
+    images = "" if _photographs_inside(capture_root(file)) else f" --images {shell_word(root)}"
     return f"{file} is a project of {PROJECTS[name].program}: vdgs run {shell_word(file)}{images} --output RUN"
 
 

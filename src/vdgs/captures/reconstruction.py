@@ -20,6 +20,8 @@ MAPPED = "mapped"
 WORK_FOLDER = "work"
 #: What says in it, and in the capture, which steps are done.
 STEPS_FILE = "steps.json"
+#: A step in the file of a finished capture: it is being made anew, and what was trained on it goes once it is replaced.
+ANEW = "anew"
 #: How far the present step is, in the work folder.
 PROGRESS_FILE = "progress.json"
 #: The photographs that it is made of, in the capture.
@@ -171,9 +173,10 @@ def _is_ours(file: Path) -> bool:
 
 
 def is_finished(root: Path) -> bool:
-    """Whether a capture that was begun here is placed, its last step."""
-    done = read_json_or_empty(root / STEPS_FILE).get("done")
-    return (root / RECONSTRUCTION_FILE).is_file() and isinstance(done, dict) and "placed" in done
+    """Whether a capture that was begun here is placed, its last step, and not being made anew."""
+    steps = read_json_or_empty(root / STEPS_FILE)
+    begun, done = ({} if not isinstance(steps.get(which), dict) else steps[which] for which in ("begun", "done"))
+    return (root / RECONSTRUCTION_FILE).is_file() and "placed" in done and ANEW not in begun
 
 
 def read_digests(output: Path) -> ContentDigests:

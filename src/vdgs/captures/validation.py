@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -187,11 +188,24 @@ def _some(names: list[str]) -> str:
 
 
 def require_trainable(capture: Capture, console: Console) -> None:
-    """Say what is doubtful about a capture and what masks leave out. Raises `CaptureError` for one that cannot become a
-    scene, and for photographs or masks that are damaged."""
+    """Say what is doubtful about a capture and what masks leave out. Raises as `find_doubts`."""
+    print_doubts(find_doubts(capture), console)
+
+
+def find_doubts(capture: Capture, sample: Literal["all"] | int = "all") -> list[str]:
+    """What is doubtful about a capture and what masks leave out, as lines for a console; decodes all photographs, or a
+    sample of so many.
+
+    Raises `CaptureError` for one that cannot become a scene, and for photographs or masks that are damaged.
+    """
     soundness = require_valid(capture)
-    checked = check_images(capture)
-    for warning in (*capture.warnings, *soundness.warnings, *checked.warnings):
-        console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
-    if checked.masked_fraction:
-        console.print(f"masks leave out {checked.masked_fraction:.1%} of the photographs", highlight=False)
+    checked = check_images(capture, sample)
+    warnings = (*capture.warnings, *soundness.warnings, *checked.warnings)
+    lines = [f"[yellow]note[/] {escape(warning)}" for warning in warnings]
+    masked = checked.masked_fraction
+    return lines + ([f"masks leave out {masked:.1%} of the photographs"] if masked else [])
+
+
+def print_doubts(lines: Sequence[str], console: Console) -> None:
+    for line in lines:
+        console.print(line, highlight=False)

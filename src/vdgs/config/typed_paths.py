@@ -1,4 +1,4 @@
-"""Paths as people type them, in options and in files of settings: what begins with ~ lies in a home folder.
+"""Paths as people type them, in options, in files of settings and in Python: what begins with ~ lies in a home folder.
 
 Shells say so of words that begin with it, but not of `--output=~/run` nor of words in quotes. What really begins with ~
 is written as ./~name; a name that is no user's stays as it is, as in shells.
@@ -19,6 +19,11 @@ class MaybeFolder:
 def holds_path(hint: Any) -> bool:
     """Whether a field's type is a path or marked as one, at any depth."""
     return hint is Path or isinstance(hint, MaybeFolder) or any(map(holds_path, typing.get_args(hint)))
+
+
+def home_path(path: str | Path) -> Path:
+    """A path with the whole path of a home folder that it begins with."""
+    return Path(os.path.expanduser(path))
 
 
 def expand_home(word: str, hint: Any) -> str:

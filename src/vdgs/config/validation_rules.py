@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from vdgs.config.method import DensifyConfig, MethodConfig, ResolutionSchedule
 from vdgs.config.ranges import find_range_errors, iter_out_of_range, range_missed
 from vdgs.config.serialization import from_dict, read_value
+from vdgs.config.type_hints import field_hints
+from vdgs.config.typed_paths import holds_path, home_path
 from vdgs.errors import VdgsError
 
 S = TypeVar("S")
@@ -38,13 +41,22 @@ def checked_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
     range.
     """
     try:
-        settings: S = from_dict(kind, values, where, numeric_text=False)
+        settings: S = from_dict(kind, _with_homes(kind, values), where, numeric_text=False)
     except ValueError as error:
         raise VdgsError(str(error)) from error
     wrong = next(iter_out_of_range(settings, (where,)), None)
     if wrong is not None:
         raise VdgsError(f"{'.'.join(wrong.path)} is {wrong.value}; it must be {wrong.range}")
     return settings
+
+
+def _with_homes(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with the whole paths of home folders that paths among them begin with."""
+    hints = field_hints(kind)
+    return {
+        name: str(home_path(value)) if isinstance(value, (str, Path)) and holds_path(hints.get(name)) else value
+        for name, value in values.items()
+    }
 
 
 def checked_value(name: str, value: Any, hint: Any) -> Any:

@@ -12,6 +12,7 @@ import os
 import secrets
 import socket
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -37,6 +38,10 @@ from vdgs.system.stop_signals import preserve_signal_handlers
 NAMESPACE = "vdgs"
 #: Memory for Ray's object store, which holds nothing: the least that Ray takes.
 OBJECT_STORE_BYTES = 80 << 20
+#: Bytes that the path of a socket may have (Linux), the longest that Ray adds to the folder of its files, and a folder
+#: that is never too long.
+MAX_SOCKET_PATH_BYTES, SHORT_FOLDER = 107, "/tmp"
+LONGEST_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store"
 #: Seconds that a node gets to answer before anything starts.
 NODE_CHECK_TIMEOUT_SECONDS = 300.0
 #: Seconds that a cluster has to take a connection.
@@ -72,7 +77,7 @@ def connect(address: str | None) -> Iterator[None]:
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
-        with _ray_driver(where, options):
+        with _socket_folder(where) as folder, _ray_driver(where, options | folder):
             yield
     finally:
         for name, value in before.items():
@@ -80,6 +85,26 @@ def connect(address: str | None) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _socket_folder(where: str) -> Iterator[dict[str, str]]:
+    """The option of a Ray of this machine that keeps its files in a short folder, where the usual one for files that
+    are not kept (RAY_TMPDIR, TMPDIR) is too long for sockets. Raises VdgsError where there is no short one."""
+    usual = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
+    if where != "local" or len(os.fsencode(usual + LONGEST_SOCKET)) <= MAX_SOCKET_PATH_BYTES:
+        yield {}
+        return
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="vdgs-ray-", dir=SHORT_FOLDER, ignore_cleanup_errors=True)
+    except OSError as error:
+        most = MAX_SOCKET_PATH_BYTES - len(LONGEST_SOCKET)
+        raise VdgsError(
+            f"{usual}: is too long for the sockets of Ray, and {SHORT_FOLDER} cannot be used ({error.strerror}). Set "
+            f"RAY_TMPDIR to a folder whose path has at most {most} bytes."
+        ) from error
+    with folder as short:
+        yield {"_temp_dir": short}
 
 
 @cache

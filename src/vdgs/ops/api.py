@@ -26,6 +26,7 @@ from vdgs.config.method import MAX_BLOCKS, AssignmentConfig, MergeConfig, Method
 from vdgs.config.presets import PRESETS, PresetName
 from vdgs.config.ranges import MAX_COUNT, Range
 from vdgs.config.type_hints import field_hints
+from vdgs.config.typed_paths import home_path
 from vdgs.config.validation_rules import checked_settings, checked_value
 from vdgs.errors import CaptureError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
@@ -72,12 +73,12 @@ class Scene:
 
     def save(self, path: str | Path) -> None:
         """Write the model as one safetensors file, atomically."""
-        self.model.save(Path(path))
+        self.model.save(home_path(path))
 
     @staticmethod
     def load(path: str | Path, capture: Capture | None = None) -> Scene:
         """Read a model that `save` or a run wrote. Raises VdgsError for a missing, damaged or other file."""
-        return Scene(AnchorModel.load(Path(path)), capture)
+        return Scene(AnchorModel.load(home_path(path)), capture)
 
 
 class Run:
@@ -143,9 +144,9 @@ def open_run(
     """
     if model not in get_args(ModelName):
         raise VdgsError(f"model={model!r}: choose one of {', '.join(get_args(ModelName))}")
-    folder = RunFolder(Path(path))
+    folder = RunFolder(home_path(path))
     folder.settings()
-    return Run(folder, model, select_device(device).device, None if capture is None else Path(capture))
+    return Run(folder, model, select_device(device).device, None if capture is None else home_path(capture))
 
 
 def load_capture(path: str | Path, **options: Any) -> Capture:
@@ -156,7 +157,7 @@ def load_capture(path: str | Path, **options: Any) -> Capture:
     """
     from vdgs.captures.loading import load_capture as load
 
-    return load(Path(path), checked_settings(CaptureOptions, options, "CaptureOptions"))
+    return load(home_path(path), checked_settings(CaptureOptions, options, "CaptureOptions"))
 
 
 def preset(name: PresetName = "laptop") -> MethodConfig:
@@ -352,14 +353,14 @@ def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
     """
     from vdgs.export.export_run import resolve_request, write_files
 
-    scene = scene.scene if isinstance(scene, Run) else scene
+    scene, file = scene.scene if isinstance(scene, Run) else scene, home_path(path)
     _check_scene(scene)
     if scene.capture is None:
         raise VdgsError(f"{path}: baking needs the training cameras: give the capture, as in Scene(model, capture)")
-    paths = {"run": Path(path).parent, "output": (Path(path),), "evaluate": False}
+    paths = {"run": file.parent, "output": (file,), "evaluate": False}
     request = resolve_request(checked_settings(ExportRequest, options | paths, "export"))
     opened = runs.OpenedRun(
-        folder=RunFolder(request.run), model=scene.model, model_path=Path(path), capture=scene.capture, key="",
+        folder=RunFolder(request.run), model=scene.model, model_path=file, capture=scene.capture, key="",
         name="merged" if scene.model.decoder_spans else "coarse", status=StatusRecord(state="done"), warning="",
     )  # fmt: skip
     write_files(opened, request, _warning_console())
@@ -403,7 +404,7 @@ def train(
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
         raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
-    train_in_run_folder(Path(capture), settings, method, Path(run_dir), _warning_console(), device)
+    train_in_run_folder(home_path(capture), settings, method, home_path(run_dir), _warning_console(), device)
     return open_run(run_dir, model="coarse" if isinstance(method, TrainConfig) else "best", device=device).scene
 
 

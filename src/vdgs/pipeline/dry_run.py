@@ -14,6 +14,8 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.loading import load_capture
+from vdgs.captures.output_guard import check_not_among_inputs
+from vdgs.captures.validation import find_doubts, print_doubts
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig, resolve_iterations
 from vdgs.config.ranges import check_ranges
@@ -32,6 +34,9 @@ from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_re
 from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
 from vdgs.system.units import data_size, rough_duration
+
+#: Photographs of a capture that are decoded to see whether they are whole (choice: some seconds).
+SAMPLE = 32
 
 
 def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
@@ -56,8 +61,12 @@ def _estimate_from_capture(request: RunRequest, console: Console, is_anew: bool 
     choice = choose_image_size(request, console)
     request = choice.request
     capture = choice.capture or load_capture(request.capture, request.options)
-    for warning in capture.warnings:
-        console.print(f"[yellow]note[/] {warning}", highlight=False)
+    check_not_among_inputs(request.output, capture)
+    print_doubts(find_doubts(capture, SAMPLE), console)
+    if len(capture.views) > SAMPLE:
+        console.print(
+            f"{SAMPLE} of {len(capture.views)} photographs were decoded; the run decodes all", highlight=False
+        )
     method = request.method()
     method = replace(method, training=resolve_iterations(method.training, len(capture.train_views)))
     status = None if is_anew else _run_status(request, capture, method, console)
@@ -107,6 +116,9 @@ def _run_status(request: RunRequest, capture: Capture, method: MethodConfig, con
         check_same_capture(run.capture_file, read_json(run.capture_file), capture)
     for line in changed_flags(run.settings(), settings):
         console.print(f"[yellow]changed[/] {line}", highlight=False)
+    if lost := run.find_lost(settings):
+        needs = "which --overwrite deletes" if request.overwrite else "so that the run is refused without --overwrite"
+        console.print(f"[yellow]warning[/] these make {' and '.join(lost)} useless, {needs}", highlight=False)
     return get_run_status(run, settings)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vdgs.captures.capture_root import capture_root
 from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
+from vdgs.captures.reconstruction import read_digests
 from vdgs.captures.strays import is_run
 from vdgs.config.commands import RunRequest
 from vdgs.errors import VdgsError
@@ -17,6 +18,7 @@ from vdgs.rendering.ortho.map_status import has_ortho_dependencies, is_ortho_cur
 from vdgs.report.status_cli import full_run_status, next_line
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import with_absolute_paths
+from vdgs.sfm.source_images import SourceImages
 from vdgs.system.atomic_files import read_json_or_empty
 
 #: What photographs and masks are called.
@@ -31,6 +33,8 @@ def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ())
         return ""
     try:
         if not (_same_request(run, request, command) and _is_whole(run, request)):
+            return ""
+        if any(not os.path.exists(file) for file in _read_files(run)):
             return ""
         made = run.capture_file.stat().st_mtime_ns
         if any(time > made for time in (*_input_times(request, files), *_photograph_times(run))):
@@ -72,6 +76,26 @@ def _input_times(request: RunRequest, files: Sequence[Path]) -> Iterator[int]:
         yield from _times(path, request.output)
 
 
+def _read_files(run: RunFolder) -> Iterator[Path]:
+    """The photographs and masks that the run was made of: the files of its capture, and those that this was made of
+    here. Runs of older versions do not tell the former."""
+    root = capture_root(Path(run.settings().capture_path))
+    for view in read_json_or_empty(run.cameras_file).get("views", ()):
+        yield from (root / view[name] for name in ("file", "mask") if view.get(name))
+    if not run.own_capture.is_dir():
+        return
+    sources = SourceImages.read(run.own_capture)
+    used = None if sources is None else {digest for each in sources.files for digest in (each.digest, each.mask)}
+    for file, digest in read_digests(run.own_capture).files().items():
+        # Digests are kept of files that were removed before the capture was made anew, too.
+        if _is_around(file.parent, run.path) and (used is None or digest in used):
+            yield file
+
+
+def _is_around(folder: str | Path, output: Path) -> bool:
+    return Path(os.path.realpath(output)).is_relative_to(os.path.realpath(folder))
+
+
 def _photograph_times(run: RunFolder) -> Iterator[int]:
     """When the photographs and masks of the capture changed last, which of a project may lie anywhere, and the folders
     that they are in."""
@@ -89,9 +113,9 @@ def _times_in(folder: str | Path, names: Sequence[str], output: Path) -> Iterato
     """When these files of a folder changed last, and when one was added, removed or renamed.
 
     In a folder around the run, where runs and what is written beside them come and go, the times at which pictures came
-    there or were renamed tell that in place of the folder's own; one that was removed is not noticed.
+    there or were renamed tell that in place of the folder's own, and `_read_files` which are gone.
     """
-    around = Path(os.path.realpath(output)).is_relative_to(os.path.realpath(folder))
+    around = _is_around(folder, output)
     if not around:
         yield os.stat(folder).st_mtime_ns
     for name in names:

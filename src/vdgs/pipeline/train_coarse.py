@@ -16,7 +16,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.photometric_gains import collect_point_colors
-from vdgs.captures.validation import require_trainable
+from vdgs.captures.validation import print_doubts
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import TrainConfig
 from vdgs.model.anchor_model import ModelMetadata
@@ -66,7 +66,7 @@ def train_coarse(context: RunContext, options: CheckpointOptions, console: Conso
         return
     with run.locked():
         capture = context.capture
-        require_trainable(capture, console)
+        print_doubts(context.find_doubts(), console)
         config = run.method().training
         warn_without_densification(config, console)
         write_json(run.capture_file, capture_metadata(capture))

@@ -73,9 +73,12 @@ def exclusive_run(
     if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
         require_valid(capture)
     run.check_output_empty()
+    context = RunContext(run, capture)
     with run.drive_lock():
+        if overwrite and run.config_file.exists() and run.find_lost(settings):
+            context.find_doubts()  # before anything is deleted for photographs that cannot be trained on
         _resume(run, capture, settings, overwrite, command)
-        yield RunContext(run, capture)
+        yield context
 
 
 def _resume(

@@ -5,7 +5,9 @@ RUN/cameras.json is written when the coarse stage begins, and belongs to the cap
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from jaxtyping import Float
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.capture_metadata import capture_fingerprint
+from vdgs.captures.capture_metadata import capture_fingerprint, is_same_fingerprint
 from vdgs.captures.capture_root import capture_root
 from vdgs.captures.output_guard import input_folders
 from vdgs.errors import RunError
@@ -58,6 +60,7 @@ def run_cameras_of_capture(capture: Capture) -> RunCameras:
 def save_run_cameras(run: RunFolder, capture: Capture) -> None:
     """Save the cameras of a capture in its run."""
     ground, root = capture.ground, capture.root.resolve()
+    relative = cache(partial(_relative_to, root))
     write_json(
         run.cameras_file,
         {
@@ -69,8 +72,8 @@ def save_run_cameras(run: RunFolder, capture: Capture) -> None:
             },
             "middle": np.median(capture.points, axis=0).tolist(),
             "camera_height": camera_height(capture),
-            "input_folders": [_relative_to(root, folder) for folder in input_folders(capture)],
-            "views": [_view_to_dict(view) for view in capture.views],
+            "input_folders": [relative(folder) for folder in input_folders(capture)],
+            "views": [_view_to_dict(view) | _files(view, relative) for view in capture.views],
         },
     )  # fmt: skip
 
@@ -83,7 +86,7 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
     record = read_json(run.cameras_file)
     root = capture_root(Path(run.settings().capture_path))
     try:
-        if record["fingerprint"] != (capture or {}).get("fingerprint"):
+        if not is_same_fingerprint(record["fingerprint"], (capture or {}).get("fingerprint")):
             return None
         views = [(each["split"], _view_from_dict(each)) for each in record["views"]]
         return RunCameras(
@@ -129,6 +132,12 @@ def _view_to_dict(view: View) -> JsonObject:
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
         "width": camera.width, "height": camera.height,
     }  # fmt: skip
+
+
+def _files(view: View, relative: Callable[[Path], str]) -> JsonObject:
+    """Where the photograph and its mask lie, by the paths of their folders relative to the capture."""
+    files = {"file": view.image_path, "mask": view.mask_path}
+    return {name: f"{relative(file.parent)}/{file.name}" for name, file in files.items() if file is not None}
 
 
 def _view_from_dict(record: JsonObject) -> tuple[str, Camera]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.validation import find_doubts
 from vdgs.config.commands import ModelName
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.model_integrity import load_verified
@@ -32,6 +33,7 @@ class RunContext:
     def __init__(self, run: RunFolder, capture: Capture | None = None) -> None:
         self.run = run
         self._capture = capture
+        self._doubts: list[str] | None = None
         #: By their names, each with the identity of the file that it was read from.
         self._models: dict[str, tuple[tuple[object, ...], AnchorModel]] = {}
 
@@ -50,6 +52,12 @@ class RunContext:
         if self._capture is None:
             self._capture = open_capture(self.run)
         return self._capture
+
+    def find_doubts(self) -> list[str]:
+        """As `validation.find_doubts` of the capture, which is looked at once."""
+        if self._doubts is None:
+            self._doubts = find_doubts(self.capture)
+        return self._doubts
 
     def open_model(
         self, which: ModelName = "best", device: torch.device | str = "cpu", *, mapped: bool = False

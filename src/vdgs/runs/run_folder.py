@@ -144,14 +144,8 @@ class RunFolder:
         old = self.settings()
         if old == settings:
             return []
-        changed = changed_flags(old, settings)
-        after = self.keys(settings)
-        lost = []
-        if self.coarse.has_output() and self.coarse.key() != after.coarse:
-            lost.append("the coarse model")
-        blocks = [folder for folder in self.block_folders() if folder.has_output() and folder.key() != after.blocks]
-        if blocks:
-            lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
+        changed, after = changed_flags(old, settings), self.keys(settings)
+        lost = self.find_lost(settings)
         if lost and not overwrite:
             raise RunError(
                 f"{self.config_file}: other settings than this run has:\n  "
@@ -163,6 +157,16 @@ class RunFolder:
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
             self.coarse.reset_unless(after.coarse)
         return changed
+
+    def find_lost(self, settings: RunSettings) -> list[str]:
+        """What was trained that other settings make useless, in words; nothing where it stays."""
+        after, lost = self.keys(settings), list[str]()
+        if self.coarse.has_output() and self.coarse.key() != after.coarse:
+            lost.append("the coarse model")
+        blocks = [folder for folder in self.block_folders() if folder.has_output() and folder.key() != after.blocks]
+        if blocks:
+            lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
+        return lost
 
     @property
     def is_trained(self) -> bool:

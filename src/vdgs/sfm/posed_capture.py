@@ -36,6 +36,7 @@ from vdgs.geometry.similarity import rotation_to_z
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, mask_files, pair_selection
+from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training
 from vdgs.sfm.feature_extraction import UNDECODABLE
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.posed_photographs import (
@@ -49,7 +50,7 @@ from vdgs.sfm.posed_photographs import (
     write_on_white,
 )
 from vdgs.sfm.random_points import random_points
-from vdgs.sfm.reconstruct import check_nothing_trained, writing
+from vdgs.sfm.reconstruct import writing
 from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress, silence_colmap
 from vdgs.system.atomic_files import write_json, write_text
@@ -88,17 +89,19 @@ def make_posed_capture(
             photographs.digests.write()
         return
     check_posed_output(photographs)
-    check_nothing_trained(request, run)
+    check_nothing_trained(request, run, photographs.keys[CAPTURE])
     console.print(
         f"{len(photographs.views)} photographs, poses and lenses as they are; points are found",
         highlight=False,
     )
     with writing(request, run):
         photographs.digests.write()
+        agree_to_discard(output, photographs.keys[CAPTURE], run)
         _find_features(photographs, work, request, threads, console)
         _match(photographs, work, request, threads, console)
         model = _triangulate(photographs, work, threads, console)
         drop_unseen_observations(model)
+        discard_training(output, run)
         if not finished.is_begun(CAPTURE, photographs.keys[CAPTURE]):
             finished.forget(CAPTURE)  # before: an interrupted removal is no finished capture
             for name in (*capture_writer.IMAGE_FOLDERS, "sparse"):

@@ -16,6 +16,7 @@ from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.reconstruction import (
+    ANEW,
     MAPPED,
     RECONSTRUCTION_FIGURE,
     RECONSTRUCTION_FILE,
@@ -26,7 +27,7 @@ from vdgs.captures.reconstruction import (
 )
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import (
     capture_writer,
@@ -39,6 +40,7 @@ from vdgs.sfm import (
 )
 from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
 from vdgs.sfm.console_report import print_reconstruction_report
+from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training
 from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.image_list import ExcludedImage
@@ -83,8 +85,8 @@ def reconstruct(
     """Make a capture of photographs in `request.output`, or go on with one that was begun.
 
     `run` is the run that the capture is for: this process drives it while anything is written, and what was trained on
-    another capture is deleted (`request.overwrite`). `command` is the command line, recorded for `vdgs status`.
-    `on_estimate` is called before work that begins, once it is told. Raises
+    another capture is deleted (`request.overwrite`) when the new one takes its place. `command` is the command line,
+    recorded for `vdgs status`. `on_estimate` is called before work that begins, once it is told. Raises
     CaptureError for photographs that cannot become a capture, RunError for a run that another process drives, VdgsError
     for an output that is something else, other photographs than before and a disk that is full. What was done is kept.
     """
@@ -102,6 +104,8 @@ def reconstruct(
             sources.write(output)
         with suppress(VdgsError):  # it saves reading, and the folder may be read-only
             digests.write()
+            if Workspace(output).has_begun(ANEW):  # others were asked for meanwhile
+                Workspace(output).forget(ANEW)
         if not request.keep_intermediate:
             work.remove()
         return before
@@ -111,6 +115,7 @@ def reconstruct(
         with writing(request, run):
             sources.write(output)
             digests.write()
+            discard_training(output, run)
             facts = _place_anew(prepared, before, found, keys, began, console)
         console.print(f"{output}: placed anew; its photographs and poses stay", highlight=False)
         print_reconstruction_report(facts, console)
@@ -128,10 +133,11 @@ def reconstruct(
             work.remove()
             work.begin("features", keys["features"])
             write_json(work.expected_file, estimate.expected_seconds)
+        agree_to_discard(output, keys["placed"], run)
         plot_positions(
             prepared.gps_priors, time_order(prepared), "Where the photographs were taken", output / POSITIONS_FIGURE
         )
-        facts = _steps(prepared, work, keys, console)
+        facts = _steps(prepared, work, keys, console, run)
     print_reconstruction_report(facts, console)
     return facts
 
@@ -167,34 +173,21 @@ def _work_left(
     if _is_finished(output, keys["placed"]) and read_reconstruction(output) is not None:
         return "nothing"
     check_unchanged(output, sources, request.overwrite)
-    check_nothing_trained(request, run)
+    check_nothing_trained(request, run, keys["placed"])
     return "placing" if _is_placed_otherwise(output, keys["capture"]) else "all"
 
 
 @contextmanager
 def writing(request: SfmRequest, run: RunFolder | None) -> Iterator[None]:
-    """Hold the locks while the capture is written, then delete the work folder, unless the work was interrupted."""
+    """Hold the locks while the capture is written, then delete the work folder, unless the work was interrupted.
+    RunError where another process works on the run, or drives it: what was trained is to be deleted."""
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
         if run is not None:
-            run.discard_training()
+            with run.locked():
+                pass
         yield
         if not request.keep_intermediate:
             Workspace(request.output / WORK_FOLDER).remove()
-
-
-def check_nothing_trained(request: SfmRequest, run: RunFolder | None) -> None:
-    """Raise RunError where a capture is about to change that a run was trained on."""
-    if run is not None and run.is_trained and not request.overwrite:
-        if SourceImages.read(run.own_capture) is None and run.config_file.exists():
-            raise RunError(
-                f"{run.path}: is a run of the capture {run.settings().capture_path}, not of these photographs. Take "
-                "another --output; --overwrite discards what was trained."
-            )
-        raise RunError(
-            f"{run.path}: its capture was made with other positions or other settings of the reconstruction (--sfm.*, "
-            "--gps), and the run was trained on it. Add --overwrite to do both again, give the old settings to "
-            "continue, or take another --output."
-        )
 
 
 def _is_finished(output: Path, key: str) -> bool:
@@ -260,7 +253,7 @@ def _place_anew(
 
 
 def _steps(
-    plan: ReconstructionPlan, workspace: Workspace, keys: dict[str, str], console: Console
+    plan: ReconstructionPlan, workspace: Workspace, keys: dict[str, str], console: Console, run: RunFolder | None
 ) -> ReconstructionReport:
     began = time.monotonic()
     photographs = plan.image_list.images
@@ -280,6 +273,7 @@ def _steps(
     check_enough_placed(models[0], left_out)
     mapped = pycolmap.Reconstruction(models[0])
     found = georeference(models[0], plan, held[0])
+    discard_training(plan.request.output, run)
     _write(plan, workspace, mapped, found.model, keys["capture"], console)
     outcome = ReconstructionResult(
         camera_groups=kinds,

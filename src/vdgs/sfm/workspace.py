@@ -107,6 +107,10 @@ class Workspace:
         """The same by whatever version."""
         return self._steps("begun").get(step, "").partition(_BY)[0] == key
 
+    def has_begun(self, step: str) -> bool:
+        """Whether a step was begun, for whatever photographs and settings."""
+        return step in self._steps("begun")
+
     def begin(self, step: str, key: str) -> None:
         self._note("begun", step, f"{key}{_VERSION}")
 

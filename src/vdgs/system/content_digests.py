@@ -37,6 +37,10 @@ class ContentDigests:
         known = {name: each for name, each in found if isinstance(each, list) and len(each) == 3}
         return ContentDigests(record, known)
 
+    def files(self) -> dict[Path, str]:
+        """The files that have been read, there or not, with their digests."""
+        return {Path(name): str(known[2]) for name, known in self._known.items()}
+
     def of(self, path: Path) -> str:
         """The digest of a file; empty for one that cannot be read."""
         check_stop_requested()

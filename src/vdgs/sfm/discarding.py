@@ -1,0 +1,42 @@
+"""What was trained on a capture that is made anew: it stays until the new capture takes the place of the old one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vdgs.captures.reconstruction import ANEW
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import RunError
+from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.source_images import SourceImages
+from vdgs.sfm.workspace import Workspace
+
+
+def agree_to_discard(output: Path, key: str, run: RunFolder | None) -> None:
+    """Record that work of this key may discard what was trained: the same command then goes on without --overwrite."""
+    if run is not None and run.is_trained:
+        Workspace(output).begin(ANEW, key)
+
+
+def discard_training(output: Path, run: RunFolder | None) -> None:
+    """Delete what was trained on a capture, right before another takes its place."""
+    if run is not None:
+        run.discard_training()
+    Workspace(output).forget(ANEW)
+
+
+def check_nothing_trained(request: SfmRequest, run: RunFolder | None, key: str = "") -> None:
+    """Raise RunError where a capture is about to change that a run was trained on, unless work of this `key` was begun
+    with --overwrite."""
+    agreed = request.overwrite or Workspace(request.output).is_begun_by_any(ANEW, key)
+    if run is not None and run.is_trained and not agreed:
+        if SourceImages.read(run.own_capture) is None and run.config_file.exists():
+            raise RunError(
+                f"{run.path}: is a run of the capture {run.settings().capture_path}, not of these photographs. Take "
+                "another --output; --overwrite discards what was trained."
+            )
+        raise RunError(
+            f"{run.path}: its capture was made with other positions or other settings of the reconstruction (--sfm.*, "
+            "--gps), and the run was trained on it. Add --overwrite to do both again, give the old settings to "
+            "continue, or take another --output."
+        )
