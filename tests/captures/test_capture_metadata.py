@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.captures.capture_metadata import MASK_CONTENTS, capture_fingerprint, capture_metadata, check_same_capture
+from vdgs.captures.capture_metadata import capture_fingerprint, capture_metadata, check_same_capture
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import RunError
@@ -57,10 +57,8 @@ def test_a_mask_that_is_edited_to_the_same_size_makes_another_capture(tmp_path, 
     write = lambda: cv2.imwrite(str(file), mask, (cv2.IMWRITE_PNG_COMPRESSION, 0))  # noqa: E731
     write()
     before, size = capture_metadata(read()), file.stat().st_size
-    older = before | {"fingerprint": {k: v for k, v in before["fingerprint"].items() if k != MASK_CONTENTS}}
     mask[20 * scale : 23 * scale, 10 * scale : 12 * scale] = 0
     write()
     assert file.stat().st_size == size
     with pytest.raises(RunError, match=r"changed: masks\. Restore"):
         check_same_capture(tmp_path / "capture.json", before, read())
-    check_same_capture(tmp_path / "capture.json", older, read())  # a run of before tells no contents

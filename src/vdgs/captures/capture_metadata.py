@@ -14,8 +14,6 @@ from vdgs.captures.capture import Capture, View
 from vdgs.errors import RunError
 from vdgs.system.documents import CaptureMetadata
 
-#: The part of a fingerprint that tells what masks hold, which those of older versions lack.
-MASK_CONTENTS = "what masks hold"
 #: A mask of at most so many bytes is read whole; of a larger one (no PNG of today's cameras is) so many pieces, spread
 #: evenly, which a change that is higher than their distance cannot miss.
 WHOLE_BYTES, PIECES = 1 << 20, 64
@@ -41,7 +39,7 @@ def capture_metadata(capture: Capture) -> CaptureMetadata:
 
 def capture_fingerprint(capture: Capture) -> dict[str, int]:
     """CRC-32 of each part of a capture that results depend on. Photographs count by name and size in bytes: to read
-    thousands of them whenever a run is opened takes too long. Masks, which often keep their size, count by content too:
+    thousands of them whenever a run is opened takes too long. Masks, which often keep their size, count by content:
     5000 take half a second. Without masks there is no part of theirs."""
     parts = {
         "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
@@ -50,23 +48,8 @@ def capture_fingerprint(capture: Capture) -> dict[str, int]:
         "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
     if masks := _masks(capture):
-        parts["masks"] = _crc(*(f"{name}:{mask.stat().st_size}" for name, mask in masks.items()))
-        parts[MASK_CONTENTS] = _crc(*(f"{name}:{_content_crc(mask)}" for name, mask in masks.items()))
+        parts["masks"] = _crc(*(f"{name}:{_content_crc(mask)}" for name, mask in masks.items()))
     return parts
-
-
-def is_same_fingerprint(before: object, now: object) -> bool:
-    """Whether two fingerprints are of the same capture, by what both of them tell."""
-    return isinstance(before, Mapping) and isinstance(now, Mapping) and not _changed_parts(before, now)
-
-
-def _changed_parts(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """The parts in which two fingerprints differ, what masks hold among these."""
-    changed = [part for part in {**now, **before} if part != MASK_CONTENTS and before.get(part) != now.get(part)]
-    both = MASK_CONTENTS in before and MASK_CONTENTS in now
-    if both and before[MASK_CONTENTS] != now[MASK_CONTENTS] and "masks" not in changed:
-        changed.append("masks")
-    return changed
 
 
 def photographs_crc(views: Sequence[View]) -> int:
@@ -82,7 +65,9 @@ def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any]
             f"{source}: does not say which capture the run belongs to. It is damaged; begin another run: "
             "vdgs run CAPTURE --output RUN"
         )
-    if changed := _changed_parts(known, capture_fingerprint(capture)):
+    now = capture_fingerprint(capture)
+    changed = [part for part in {**now, **known} if known.get(part) != now.get(part)]
+    if changed:
         raise RunError(
             f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "
             "Restore the capture as it was (or the former version of vdgs, where that read the same files otherwise), "

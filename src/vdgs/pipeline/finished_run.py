@@ -78,7 +78,7 @@ def _input_times(request: RunRequest, files: Sequence[Path]) -> Iterator[int]:
 
 def _read_files(run: RunFolder) -> Iterator[Path]:
     """The photographs and masks that the run was made of: the files of its capture, and those that this was made of
-    here. Runs of older versions do not tell the former."""
+    here."""
     root = capture_root(Path(run.settings().capture_path))
     for view in read_json_or_empty(run.cameras_file).get("views", ()):
         yield from (root / view[name] for name in ("file", "mask") if view.get(name))

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.capture_metadata import capture_fingerprint, is_same_fingerprint
+from vdgs.captures.capture_metadata import capture_fingerprint
 from vdgs.captures.capture_root import capture_root
 from vdgs.captures.output_guard import input_folders
 from vdgs.errors import RunError
@@ -86,7 +86,7 @@ def load_run_cameras(run: RunFolder, capture: CaptureMetadata | None) -> RunCame
     record = read_json(run.cameras_file)
     root = capture_root(Path(run.settings().capture_path))
     try:
-        if not is_same_fingerprint(record["fingerprint"], (capture or {}).get("fingerprint")):
+        if record["fingerprint"] != (capture or {}).get("fingerprint"):
             return None
         views = [(each["split"], _view_from_dict(each)) for each in record["views"]]
         return RunCameras(
