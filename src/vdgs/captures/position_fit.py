@@ -120,9 +120,7 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
     chosen, level_deg = _chosen(likely, moments, BOTH_WITHIN * up.deviation_deg)
     held = replace(up, direction=level.T @ chosen, deviation_deg=HELD_DEG)
     levelled = replace(problem, up=held)
-    fit = min(
-        (settle(levelled, start, "unused") for start in _upright_starts(levelled)), key=lambda each: each.score
-    )
+    fit = min((settle(levelled, start, "unused") for start in _upright_starts(levelled)), key=lambda each: each.score)
     scale, north_deg = _moved_by_tilts(likely, moments, rotation_to_z(chosen))
     moved_deg = float(np.degrees(np.arccos(min(1.0, chosen[2]))))
     return replace(

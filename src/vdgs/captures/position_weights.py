@@ -11,12 +11,15 @@ from __future__ import annotations
 import numpy as np
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT
+from vdgs.system.units import two_digits
 
 #: Deviations that differ by no more than this factor count as one; none counts as more times better or worse than the
 #: median (choice).
 ALIKE_TIMES, MOST_TIMES = 2.0, 1000.0
 #: Positions that state their accuracy speak for all where they have so much of the weight (choice).
 NEARLY_ALL = 0.9
+#: Positions that are so many times worse than those that count are told (choice).
+GOOD_TIMES = 4.0
 #: Degrees of freedom of Student's t, as which residuals spread: outliers tell little of what is shared.
 TAILS = 3.0
 #: What is shared is looked for in steps by this factor; rounds in which the spread of residuals settles.
@@ -45,13 +48,27 @@ def relative_deviations(deviations: np.ndarray) -> np.ndarray | None:
 
 
 def are_told(deviations: np.ndarray, are_stated: np.ndarray) -> bool:
-    """Whether a receiver tells how good the positions are: by each of them [n, k], or by so many, and so good ones, that
-    the others hardly count."""
+    """Whether a receiver tells how good the positions are: by each of them [n, k], or by so many and so good ones
+    that the others hardly count."""
     if are_stated.all():
         return bool(len(are_stated))
     weights = 1 / deviations**2
     shares = weights[are_stated].sum(axis=0) / weights.sum(axis=0)
     return bool(are_stated.sum() >= ENOUGH_TO_DOUBT and (shares >= NEARLY_ALL).all())
+
+
+def weighing_note(deviations: np.ndarray, inliers: np.ndarray) -> str:
+    """What to say of positions [n, k] of so different accuracy that each counts by its own; empty where all are alike.
+    Accuracies are those that the positions were found to have, in metres across."""
+    across = deviations[inliers, 0]
+    best = across <= GOOD_TIMES * typical(across[:, None])[0]
+    if best.all():
+        return ""
+    good, others = (two_digits(float(np.median(across[which]))) for which in (best, ~best))
+    return (
+        f"positions count by the accuracy that each states: {int(best.sum())} of them, good to {good} m across, place "
+        f"the scene; the other {int((~best).sum())}, good to {others} m, hardly count."
+    )
 
 
 def typical(deviations: np.ndarray) -> np.ndarray:
