@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from support.captures import tiny_scene
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
+from vdgs.captures.ground_estimation import find_ground_frame
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.geometry.geodesy import geodetic_from_enu
 
 AXES = np.array([1.0, 1.0, 2.0])
 COUNT = 48
@@ -88,3 +93,22 @@ def test_positions_that_state_about_the_same_count_alike(said_m):
     other, _ = fitted(np.full(COUNT, said_m), said, 0, weighed=False)
     assert np.array_equal(one.placed, other.placed)
     assert weighing_note(one.deviations, one.inliers) == ""
+
+
+def test_accuracies_in_a_table_count_for_a_capture_with_poses(tmp_path):
+    scene, rng = tiny_scene(), np.random.default_rng(0)
+    views, rows = [], ["name,lat,lon,alt,hacc,vacc"]
+    for k, (name, camera) in enumerate(scene.cameras.items()):
+        pose, good = camera.camera_from_world, 0.02 if k % 2 else 3.0
+        lens = Intrinsics("PINHOLE", (50.0, 50.0, 32.0, 24.0), 64, 48)
+        views.append(SourceView(name=name, camera_from_world=pose, intrinsics=lens))
+        place = camera.position + rng.normal(0, good, 3)
+        lat, lon, alt = geodetic_from_enu(place[None], (46.8, -92.0, 160.0))[0]
+        rows.append(f"{name},{lat:.10f},{lon:.10f},{alt:.4f},{good},{2 * good}")
+    (tmp_path / "gps.csv").write_text("\n".join(rows))
+    source = SourceCapture(
+        source="colmap", images="images", views=tuple(views), points=scene.points, colors=scene.colors
+    )
+    frame, warnings = find_ground_frame(source, tmp_path, CaptureOptions(gps=tmp_path / "gps.csv"))
+    assert "positions count by the accuracy that each states" in "".join(warnings)
+    assert frame.scale == pytest.approx(1.0, abs=0.01)
