@@ -75,6 +75,13 @@ def test_accuracies_that_the_residuals_contradict_do_no_harm(share):
         assert fit.place_error_m[0] > 0.5 * plain.place_error_m[0]
 
 
+def test_accuracies_that_say_the_opposite_make_positions_no_worse_than_they_are():
+    worse = bad(0.5, 0)
+    fit, error = fitted(np.where(worse, 0.02, 2.0), np.where(worse, 2.0, 0.02), 0)
+    assert fit.gps_std[0] < 2.5
+    assert (error < [1.5, 1.5, 3.0]).all()
+
+
 def test_a_wrong_fix_is_an_outlier_by_its_own_accuracy():
     worse = bad(0.4, 0)
     off = np.where(worse, 2.0, 0.02)

@@ -83,8 +83,8 @@ def as_many(deviations: np.ndarray) -> np.ndarray:
 
 
 def agreed(relative: np.ndarray, residuals: np.ndarray, leverages: np.ndarray) -> np.ndarray:
-    """By how many times positions [n, 3] are worse than another, as they are stated and as far as residuals [n, 3]
-    agree: across together, and up. `leverages` [n, 3] is by how much the fit follows each of them.
+    """By how many times positions [n, 3] are worse than those that count, as they are stated and as far as residuals
+    [n, 3] agree: across together, and up. `leverages` [n, 3] is by how much the fit follows each of them.
 
     So few that the fit could follow each say nothing of their accuracy; it then counts as that of more.
     """
@@ -93,7 +93,8 @@ def agreed(relative: np.ndarray, residuals: np.ndarray, leverages: np.ndarray) -
     free = residuals / np.sqrt(np.clip(1 - leverages, LEAST_FREE, 1.0))
     across = _shared(relative[:, :2], free[:, :2])
     up = _shared(relative[:, 2:], free[:, 2:]) if residuals[:, 2].any() else 0.0
-    return np.hypot(relative, [across, across, up])
+    found = np.hypot(relative, [across, across, up])
+    return np.asarray(found / typical(found))
 
 
 def _shared(relative: np.ndarray, residuals: np.ndarray) -> float:
