@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from vdgs.captures.gps_altitudes import with_altitudes, without_zero_altitudes
 from vdgs.captures.gps_tables import GpsRow, check_geodetic, read_gps_table
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
 from vdgs.captures.odd_positions import are_far_off, are_nowhere
+from vdgs.captures.plane_fit import LEAST_M
 from vdgs.errors import CaptureError
 from vdgs.system.units import first_names
 
@@ -104,6 +106,8 @@ class GpsPositions:
     """What the table leaves in doubt."""
     datum_error_m: float
     """How far all places may be off by the datum of the table's system."""
+    deviations: np.ndarray
+    """Standard deviations east, north and up that the table states [m, 3], metres; NaN where it states none."""
 
 
 def match_gps(names: Sequence[str], file: Path) -> GpsPositions:
@@ -131,7 +135,9 @@ def match_gps(names: Sequence[str], file: Path) -> GpsPositions:
     kept, has_altitudes = with_altitudes(positions[:, 2], known)
     positions = np.where([True, True, has_altitudes], positions, 0.0)
     images = np.array(list(found), int)[kept]
-    return GpsPositions(images, positions[kept], has_altitudes, tuple(notes), table.datum_error_m)
+    stated = [(math.nan,) * 3 if row.gps_std is None else (row.gps_std[0], *row.gps_std) for row in found.values()]
+    deviations = np.maximum(np.array(stated).reshape(-1, 3)[kept], LEAST_M)
+    return GpsPositions(images, positions[kept], has_altitudes, tuple(notes), table.datum_error_m, deviations)
 
 
 def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbered: bool = False) -> dict[int, GpsRow]:

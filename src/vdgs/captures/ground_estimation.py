@@ -31,8 +31,9 @@ from vdgs.captures.gps_altitudes import refuse_unit, wrong_unit
 from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.odd_positions import MIN_SPREAD_M, do_not_spread
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_adjustment import PositionFit, Problem, Up
+from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
+from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import by_axis
 from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.up_axis import estimate_up, up_by_views
@@ -245,7 +246,13 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     direction, deviation, sure = up_by_views(scene.centers, scene.rotations, scene.points)
     times = _taken_in_order([scene.names[i] for i in indices])
     up = Up(direction, deviation, "the views", sure)
-    problem = Problem(centers=centers, targets=enu, times=times, up=up, has_altitudes=has_altitudes)
+    said = np.isfinite(positions.deviations).all(axis=1)
+    usual = [USUAL_M[0], *USUAL_M]
+    deviations = with_unstated(np.where(said[:, None], positions.deviations, usual), said)
+    problem = Problem(
+        centers=centers, targets=enu, times=times, up=up, has_altitudes=has_altitudes,
+        stated=deviations if are_told(deviations, said) else None, relative=relative_deviations(deviations),
+    )  # fmt: skip
     others = {"east and north": enu[:, [1, 0, 2]], "signs": enu * [-1.0, 1.0, 1.0]}
     if sure and mirrored(centers, enu, direction, others):
         raise CaptureError(
@@ -257,6 +264,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     if refused:
         warnings.append(f"{file.name}: {refused}; it is ignored and the frame is estimated.")
         return None
+    if weighed := weighing_note(fit.deviations, fit.inliers):
+        warnings.append(f"{file.name}: {weighed}")
     similarity, inliers, has_altitudes = fit.similarity, fit.inliers, fit.altitude != "none"
     if not inliers.all():
         names = ", ".join(scene.names[i] for i in indices[~inliers][:5])

@@ -35,10 +35,12 @@ class Moments:
     """Of the positions about their middle."""
 
     @classmethod
-    def of(cls, turned: np.ndarray, targets: np.ndarray) -> Moments:
-        away, plane = turned - turned.mean(axis=0), in_plane(targets)
-        plane = plane - plane.mean()
-        return cls(away.T @ away, away.T @ plane, float((np.abs(plane) ** 2).sum()))
+    def of(cls, turned: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Moments:
+        """Of positions that count by weights [n], 1 where all are alike."""
+        away, plane = turned - np.average(turned, 0, weights), in_plane(targets)
+        plane = plane - np.average(plane, weights=weights)
+        weighed = away * weights[:, None]
+        return cls(weighed.T @ away, weighed.T @ plane, float((weights * np.abs(plane) ** 2).sum()))
 
     def turned(self, rotation: np.ndarray) -> Moments:
         return Moments(rotation @ self.spread @ rotation.T, rotation @ self.shared, self.power)

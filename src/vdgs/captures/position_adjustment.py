@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri, fdtri, stdtrit
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
+from vdgs.captures.position_weights import agreed, as_many, typical
 from vdgs.geometry.similarity import Similarity
 
 #: From so many on, east and north have a standard deviation each; of fewer they share one.
@@ -67,8 +68,10 @@ class PositionFit:
     """Where the similarity puts the cameras [n, 3]."""
     residuals: np.ndarray
     """Placed minus recorded [n, 3], metres."""
+    deviations: np.ndarray
+    """Standard deviations of each position east, north and up [n, 3], metres."""
     gps_std: np.ndarray
-    """Standard deviation of a position east, north and up [3], metres."""
+    """The same of a position as those that count [3], metres: of all where all are alike."""
     altitude: str
     """`used`, `drifts`, `unused`, or `none` where there are none."""
     drift_m: float
@@ -82,6 +85,11 @@ class PositionFit:
     """Of the whole scene, across and up."""
     score: float
     """Negative log likelihood, to compare fits of the same positions."""
+
+    @property
+    def influences(self) -> np.ndarray:
+        """Residuals of the positions that are trusted [m, 3], each as far as its position counts."""
+        return np.asarray(self.residuals[self.inliers] * (self.gps_std / self.deviations[self.inliers]) ** 2)
 
     def why_refused(self, source: str) -> str:
         """Why the fit is worse than none, in words; empty where it is not."""
@@ -109,6 +117,8 @@ class Problem:
     """The factor from the cameras' world to metres, and its standard deviation as a share."""
     stated: np.ndarray | None = None
     """Standard deviations [n, 3] that the receiver itself states."""
+    relative: np.ndarray | None = None
+    """By how many times each position is said to be worse than the usual one [n, 3]; None where all are alike."""
     has_altitudes: bool = True
     """Whether the targets have heights; where not, heights are ignored and the fit is one in the plane."""
     flights: np.ndarray | None = None
@@ -146,31 +156,44 @@ def settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     inliers, times = np.ones(count, bool), problem.times - problem.times.mean()
     if model == "drifts":  # the start has it in the residuals
         state = replace(state, drift=_slope(times, -_residuals(problem, state, middle, times)[:, 2]))
+    weights, leverages = np.ones((count, 3)), np.zeros((count, 3))
     for _ in range(ROUNDS):
         residuals = _residuals(problem, state, middle, times)
-        inliers = _trusted(residuals, _deviations(residuals[inliers], model, problem.stated, True), model)
-        gps_std = _deviations(residuals[inliers], model, problem.stated)
-        alike = alike_factors(residuals[inliers], problem.in_order(inliers))
-        state, normal, gains = _step(problem, state, middle, times, inliers, gps_std * alike, model)
+        if problem.relative is not None:
+            weights = agreed(problem.relative, residuals, leverages)
+        whole = residuals / weights
+        inliers = _trusted(whole, _deviations(whole[inliers], model, problem.stated, True), model)
+        deviations = _deviations(whole[inliers], model, problem.stated) * weights
+        alike = alike_factors((whole / weights)[inliers], problem.in_order(inliers))
+        state, normal, gains, leverages[inliers] = _step(
+            problem, state, middle, times, inliers, deviations[inliers] * alike, model
+        )
     residuals = _residuals(problem, state, middle, times)
-    gps_std = _deviations(residuals[inliers], model, problem.stated)
+    deviations = _deviations((residuals / weights)[inliers], model, problem.stated) * weights
+    used = deviations[inliers]
+    gps_std = typical(used) if problem.relative is not None else used[0]
     translation = state.middle - state.scale * state.rotation @ middle
     similarity = Similarity(state.scale, state.rotation, translation)
     placed = similarity.apply(problem.centers)
     order = problem.in_order(inliers)
-    wandering = _wandering(residuals[inliers], order, gains)
-    scale, north, level, place = _errors(
-        normal, wandering, int(inliers.sum()), gps_std, state.drift, model, problem.stated
-    )
+    wandering = _wandering((residuals / weights)[inliers], order, gains * weights[inliers])
+    scale, north, level, place = _errors(normal, wandering, used, gps_std, state.drift, model, _said(problem, inliers))
     level = _with_unseen_step(level, problem, state, gains[:, order], gps_std)
     return PositionFit(
         similarity=similarity, inliers=inliers, residuals=placed - problem.targets, placed=placed,
-        gps_std=gps_std, altitude=model if problem.has_altitudes else "none",
+        deviations=deviations, gps_std=gps_std, altitude=model if problem.has_altitudes else "none",
         drift_m=state.drift if model == "drifts" else 0.0,
         scale_error=scale, wandering_error=2 * math.sqrt(wandering[0]), north_error_deg=north,
         level_error_deg=level, place_error_m=place,
-        score=_score(problem, state, inliers, gps_std, model),
+        score=_score(problem, state, inliers, deviations, model),
     )  # fmt: skip
+
+
+def _said(problem: Problem, inliers: np.ndarray) -> np.ndarray | None:
+    """The deviation [3] that receivers state of the positions that count; None where they state none."""
+    if problem.stated is None:
+        return None
+    return typical(problem.stated[inliers]) if problem.relative is not None else np.median(problem.stated, axis=0)
 
 
 def _residuals(problem: Problem, state: _State, middle: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -237,12 +260,12 @@ def _step(
     middle: np.ndarray,
     times: np.ndarray,
     inliers: np.ndarray,
-    gps_std: np.ndarray,
+    deviations: np.ndarray,
     model: str,
-) -> tuple[_State, np.ndarray, np.ndarray]:
-    """Some steps of Gauss and Newton; the normal matrix [8, 8] of log scale, rotation, place and drift; and by how much
-    each of these changes with each residual [8, m, 3]."""
-    sigma = gps_std * np.array([1.0, 1.0, UNUSED_TIMES if model == "unused" else 1.0])
+) -> tuple[_State, np.ndarray, np.ndarray, np.ndarray]:
+    """Some steps of Gauss and Newton; the normal matrix [8, 8] of log scale, rotation, place and drift; by how much
+    each of these changes with each residual [8, m, 3]; and by how much the fit follows each position [m, 3]."""
+    sigma = deviations * np.array([1.0, 1.0, UNUSED_TIMES if model == "unused" else 1.0])
     away, spread = problem.centers[inliers] - middle, np.deg2rad(problem.up.deviation_deg)
     for _ in range(STEPS):
         turned = state.scale * away @ state.rotation.T
@@ -253,7 +276,7 @@ def _step(
         jacobian[:, 2, 1], jacobian[:, 2, 2] = turned[:, 1], -turned[:, 0]
         jacobian[:, :, 4:7] = np.eye(3)
         jacobian[:, 2, 7] = times[inliers] if model == "drifts" else 0.0
-        weighed = (jacobian / sigma[:, None]).reshape(-1, 8)
+        weighed = (jacobian / sigma[:, :, None]).reshape(-1, 8)
         off = (_residuals(problem, state, middle, times)[inliers] / sigma).ravel()
         rows, values = [weighed], [off]
         up = state.rotation @ problem.up.direction
@@ -282,8 +305,8 @@ def _step(
             state.drift + change[7],
         )
     covariance = np.linalg.pinv(normal, hermitian=True)
-    gains = covariance @ (jacobian / sigma[:, None] ** 2).reshape(-1, 8).T
-    return state, normal, gains.reshape(8, -1, 3)
+    gains = (covariance @ (jacobian / sigma[:, :, None] ** 2).reshape(-1, 8).T).reshape(8, -1, 3)
+    return state, normal, gains, np.einsum("kma,mak->ma", gains, jacobian)
 
 
 def tilt_of(up: np.ndarray) -> np.ndarray:
@@ -310,32 +333,33 @@ def _wandering(residuals: np.ndarray, order: np.ndarray, gains: np.ndarray) -> n
 def _errors(
     normal: np.ndarray,
     wandering: np.ndarray,
-    count: int,
+    deviations: np.ndarray,
     gps_std: np.ndarray,
     drift: float,
     model: str,
-    stated: np.ndarray | None,
+    said: np.ndarray | None,
 ) -> tuple[float, float, float, tuple[float, float]]:
     """What 95 % stay below, from the normal matrix: of scale, of north and level in degrees, of place across and up. A
     receiver may be off for a whole flight by as much as it is off from photograph to photograph."""
+    is_few, across_and_up = len(deviations) < ENOUGH_TO_DOUBT, as_many(deviations)
+    count, count_up = float(across_and_up[:2].min()), float(across_and_up[2])
     covariance = np.linalg.pinv(normal, hermitian=True)
     values = np.linalg.eigvalsh(normal[:7, :7])
     open_ = values[0] <= 1e-12 * values[-1]
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) + wandering) * float(
-        stdtrit(2 * count - 4 + (2 if count < ENOUGH_TO_DOUBT else 0), 0.975)
+        stdtrit(max(2 * count - 4, 0) + (2 if is_few else 0), 0.975)
     )
     if open_:
         errors[:4] = np.where(errors[:4] > 0, errors[:4], math.pi)
     common, is_found = gps_std, True
-    if stated is not None:
-        said = np.median(stated, axis=0)
+    if said is not None:
         common, is_found = np.where(gps_std > BELIEVED * said, gps_std, said), bool((gps_std > BELIEVED * said).any())
-    usual = 2 if count < ENOUGH_TO_DOUBT else 0  # what positions usually are counts, too
-    free = np.array([2 * count - 4, count - {"used": 3, "drifts": 4, "unused": 1}[model]]) + usual
+    usual = 2 if is_few else 0  # what positions usually are counts, too
+    free = np.array([2 * count - 4, count_up - {"used": 3, "drifts": 4, "unused": 1}[model]]) + usual
     free = np.maximum(free, 1) if is_found else np.full(2, np.inf)
     across = radius_95(np.maximum(np.diag(covariance)[4:6], 0.0) + wandering[4:6] + common[:2] ** 2, free[0])
     times = radius_95(np.ones(1), free[1])
-    mean_up = times * float(gps_std[2]) / math.sqrt(count) if model == "unused" else float(errors[6])
+    mean_up = times / math.sqrt((1 / deviations[:, 2] ** 2).sum()) if model == "unused" else float(errors[6])
     # What is level decides how much of the altitudes is drift: at most half of it again may be tilt.
     drift_error = min(float(errors[7]), abs(drift) / 2) if model == "drifts" else 0.0
     up = math.hypot(mean_up, times * float(common[2]) + (abs(drift) + drift_error) / 2)
@@ -366,9 +390,9 @@ def _with_unseen_step(
     return max(level_deg, min(math.hypot(level_deg, float(np.degrees(step))), most))
 
 
-def _score(problem: Problem, state: _State, inliers: np.ndarray, gps_std: np.ndarray, model: str) -> float:
+def _score(problem: Problem, state: _State, inliers: np.ndarray, deviations: np.ndarray, model: str) -> float:
     """Negative log likelihood; positions that are left out cost what their limit would."""
-    count, left_out = len(inliers), int((~inliers).sum())
+    left_out = int((~inliers).sum())
     tilt = float(np.degrees(np.linalg.norm(tilt_of(state.rotation @ problem.up.direction))))
     known = 0.0
     if problem.scale is not None:
@@ -376,7 +400,7 @@ def _score(problem: Problem, state: _State, inliers: np.ndarray, gps_std: np.nda
     costs = {"used": 0.0, "drifts": DRIFT_COSTS, "unused": UNUSED_COSTS}[model]
     costs *= 1 if problem.stated is None else STATED_TIMES
     return float(
-        count * np.log(gps_std).sum()
+        np.log(deviations).sum()
         + 0.5 * LEFT_OUT_SIGMAS**2 * left_out
         + 0.5 * (tilt / problem.up.deviation_deg) ** 2
         + known

@@ -18,6 +18,7 @@ from vdgs.captures.gps_altitudes import are_over_ground
 from vdgs.captures.likely_tilts import Likely, Moments, likely_tilts
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, fit_plane, in_plane
 from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, alike_factors, settle
+from vdgs.captures.position_weights import ALIKE_TIMES
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
 
 #: Up is held to so many degrees. 95 % of errors in two directions lie within so many standard deviations of one.
@@ -30,7 +31,7 @@ TELL_BETTER, ONE_HEIGHT = 1.5, 0.15
 def fit_positions(problem: Problem) -> PositionFit:
     """The likeliest similarity of cameras that are not mirrored; needs three positions. Altitudes that are heights over
     the ground count as none."""
-    starts = [_upright_start(problem)]
+    starts = _upright_starts(problem)
     if problem.has_altitudes and problem.up.sure and len(problem.centers) >= ENOUGH_TO_DOUBT:
         plane = _settle_in_plane(replace(problem, has_altitudes=False))
         if are_over_ground(problem.targets[:, 2], plane.placed, problem.up.deviation_deg):
@@ -53,18 +54,32 @@ def fit_positions(problem: Problem) -> PositionFit:
 def _level_as_known(drifting: PositionFit, plane: PositionFit) -> PositionFit:
     """The fit in the plane with what altitudes that drift say of themselves and of how high the scene lies."""
     return replace(
-        plane, altitude=drifting.altitude, drift_m=drifting.drift_m, score=drifting.score, gps_std=drifting.gps_std,
+        plane, altitude=drifting.altitude, drift_m=drifting.drift_m, score=drifting.score,
+        deviations=drifting.deviations, gps_std=drifting.gps_std,
         place_error_m=(plane.place_error_m[0], drifting.place_error_m[1]),
     )  # fmt: skip
 
 
 def _says_less_than_views(fit: PositionFit, problem: Problem) -> bool:
     """Whether altitudes tell up less well than it is known without positions."""
+    weights = fit.gps_std[2] / fit.deviations[fit.inliers, 2:]
     places = fit.placed[fit.inliers, :2]
-    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1]
-    alike = alike_factors(fit.residuals[fit.inliers], problem.in_order(fit.inliers))[2]
+    middle = (places * weights**2).sum(axis=0) / (weights**2).sum()
+    spread = np.linalg.svd((places - middle) * weights, compute_uv=False)[1]
+    alike = alike_factors(fit.influences, problem.in_order(fit.inliers))[2]
     tilt = np.degrees(np.arctan2(fit.gps_std[2] * alike, max(float(spread), 1e-9)))
     return bool(tilt > problem.up.deviation_deg and fit.gps_std[2] > 2 * fit.gps_std[:2].max())
+
+
+def _upright_starts(problem: Problem) -> list[Similarity]:
+    """Of all positions alike, and of those alone that are said to be the best: among many bad ones they hardly count at
+    first."""
+    starts = [_upright_start(problem)]
+    if problem.relative is not None and len(problem.centers) > ENOUGH_TO_DOUBT:
+        worst = problem.relative.max(axis=1)
+        best = worst <= ALIKE_TIMES * np.sort(worst)[ENOUGH_TO_DOUBT - 1]
+        starts.append(_upright_start(replace(problem, centers=problem.centers[best], targets=problem.targets[best])))
+    return starts
 
 
 def _upright_start(problem: Problem) -> Similarity:
@@ -95,15 +110,17 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
     likely directions, and what they leave open of scale and north is part of the errors.
     """
     up, level = problem.up, rotation_to_z(problem.up.direction)
-    start = _upright_start(problem)
+    starts = _upright_starts(problem)
     for is_likeliest in (False, True):  # what a start far off leaves is alike, and says nothing of the positions
-        free = settle(problem, start, "unused")
-        moments = Moments.of((problem.centers @ level.T)[free.inliers], problem.targets[free.inliers])
+        free = min((settle(problem, start, "unused") for start in starts), key=lambda fit: fit.score)
+        weights = (free.gps_std[:2].mean() / free.deviations[free.inliers, :2].mean(axis=1)) ** 2
+        moments = Moments.of((problem.centers @ level.T)[free.inliers], problem.targets[free.inliers], weights)
         likely = likely_tilts(moments, *_worth(free, problem, is_likeliest), up.deviation_deg, problem.scale)
-        start = _upright_start(replace(problem, up=replace(up, direction=level.T @ likely.likeliest)))
+        starts = _upright_starts(replace(problem, up=replace(up, direction=level.T @ likely.likeliest)))
     chosen, level_deg = _chosen(likely, moments, BOTH_WITHIN * up.deviation_deg)
     held = replace(up, direction=level.T @ chosen, deviation_deg=HELD_DEG)
-    fit = settle(replace(problem, up=held), _upright_start(replace(problem, up=held)), "unused")
+    levelled = replace(problem, up=held)
+    fit = min((settle(levelled, start, "unused") for start in _upright_starts(levelled)), key=lambda each: each.score)
     scale, north_deg = _moved_by_tilts(likely, moments, rotation_to_z(chosen))
     moved_deg = float(np.degrees(np.arccos(min(1.0, chosen[2]))))
     return replace(
@@ -118,7 +135,7 @@ def _settle_in_plane(problem: Problem) -> PositionFit:
 def _worth(fit: PositionFit, problem: Problem, is_likeliest: bool) -> tuple[float, float]:
     """As how many independent positions those that are trusted count, fewer where residuals of the likeliest fit follow
     each other alike; and by how much positions are usually off, in metres."""
-    alike = float(alike_factors(fit.residuals[fit.inliers], problem.in_order(fit.inliers))[:2].max())
+    alike = float(alike_factors(fit.influences, problem.in_order(fit.inliers))[:2].max())
     alike = alike if is_likeliest else 1.0
     usual = USUAL_M[0] if problem.stated is None else float(np.median(problem.stated[:, :2]))
     return int(fit.inliers.sum()) / alike**2, usual

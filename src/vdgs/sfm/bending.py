@@ -40,20 +40,23 @@ def bend_to_positions(
     if accuracy is None or accuracy.positions_m is None or accuracy.altitude != "used":
         return model
     deviations = np.array(accuracy.positions_m)
-    if placed.inliers.sum() < ENOUGH_POSITIONS or deviations.max() > GOOD_SHARE * _height(model):
+    each = placed.deviations if placed.deviations is not None else np.tile(deviations, (len(placed.inliers), 1))
+    good = (each[placed.inliers] <= GOOD_SHARE * _height(model)).all(axis=1)
+    if good.sum() < ENOUGH_POSITIONS or deviations.max() > GOOD_SHARE * _height(model):
         return model
     bent = pycolmap.Reconstruction(model)
     images = {image.name: image for image in bent.images.values() if image.has_pose}
     priors: list[pycolmap.PosePrior] = []
     used = placed.targets[placed.inliers]
-    for row, target in zip(placed.position_rows[placed.inliers].tolist(), used, strict=True):
+    rows = placed.position_rows[placed.inliers].tolist()
+    for row, target, deviation in zip(rows, used, each[placed.inliers], strict=True):
         image = images[photographs[int(positions.image_indices[row])].name]
         priors.append(
             pycolmap.PosePrior(
                 pose_prior_id=len(priors) + 1,
                 corr_data_id=image.data_id,
                 position=target,
-                position_covariance=np.diag(deviations**2),
+                position_covariance=np.diag(deviation**2),
                 coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
             )
         )

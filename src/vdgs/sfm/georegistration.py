@@ -11,6 +11,7 @@ from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
+from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
@@ -75,6 +76,8 @@ class Georegistration:
     """Of them, placed minus recorded, metres [m, 3]; [m, 2] where no altitudes are recorded."""
     inliers: np.ndarray
     """Which of them the placing trusts, [m] bool."""
+    deviations: np.ndarray | None = None
+    """What each of them was found to be good for [m, 3], metres; None where that was not found."""
     accuracy: AccuracyFacts | None = None
     notes: tuple[str, ...] = ()
     is_georeferenced: bool = True
@@ -107,7 +110,8 @@ def georegister(
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
     up, notes = up_of(model, images_metadata)
     taken = [images_metadata[int(positions.image_indices[row])] for row in rows]
-    stated = stated or (len(positions.are_stated) > 0 and bool(positions.are_stated[rows].all()))
+    said = positions.are_stated[rows] if len(positions.are_stated) and not stated else np.full(len(rows), stated)
+    deviations = with_unstated(positions.gps_std[rows], said)
     problem = Problem(
         centers=centers,
         targets=targets,
@@ -115,7 +119,8 @@ def georegister(
         flights=positions.flights[rows] if len(positions.flights) == len(positions) else None,
         up=up,
         scale=scale,
-        stated=positions.gps_std[rows] if stated else None,
+        stated=deviations if are_told(deviations, said) else None,
+        relative=relative_deviations(deviations),
         has_altitudes=positions.has_altitudes,
     )
     others = _other_readings(targets, positions.origin) if up.sure else {}
@@ -148,7 +153,7 @@ def georegister(
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
-    notes += of_reading + of_line + of_north
+    notes += of_reading + of_line + of_north + list(filter(None, [weighing_note(fit.deviations, fit.inliers)]))
     return Georegistration(
         similarity=fit.similarity,
         method=how,
@@ -156,6 +161,7 @@ def georegister(
         targets=fit.placed - fit.residuals,
         residuals=_recorded(fit.placed - levelled.targets, positions),
         inliers=fit.inliers,
+        deviations=fit.deviations,
         accuracy=accuracy_of(fit, positions, offsets),
         notes=tuple(notes),
     )
