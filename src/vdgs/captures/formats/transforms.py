@@ -219,7 +219,7 @@ def _splits(
             notes += unknown
     if options.test_list is None and options.split in ("auto", "explicit"):
         notes += tested_only(sorted(listed["train"] & listed["test"]))
-    splits: dict[str, Split] = dict.fromkeys(listed["train"], "train") | dict.fromkeys(listed["test"], "test")
+    splits = {name: side for side, found in listed.items() for name in found}  # what is in both becomes "test"
     if len(sides) == 1:
         rest: Split = "train" if "test" in sides else "test"
         return {name: splits.get(name, rest) for name in names}
