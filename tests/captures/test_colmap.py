@@ -123,6 +123,24 @@ def test_names_that_lead_out_of_the_image_folder_are_found_in_it_by_their_ends(t
         assert view.image_path == tmp_path / "images" / Path(view.name).name
 
 
+@pytest.mark.parametrize("tail", ["", ".png", " 02", " 2.5 b"])
+def test_images_may_lack_the_lines_of_their_points_whatever_they_are_called(tmp_path, tail):
+    """Names of digits alone are numbers too, and are no pixels."""
+    scene = tiny_scene()
+    cameras = {f"{k:04d}{tail}": camera for k, camera in enumerate(scene.cameras.values())}
+    scene = TinyScene(cameras, scene.points, scene.colors)
+    folder = write_colmap(tmp_path, scene, text=True, images=None)
+    assert_same(read_colmap(folder), scene)
+    file = folder / "images.txt"
+    poses = [line for line in file.read_text(encoding="utf-8").splitlines() if len(line.split()) > 9]
+    file.write_text("\n".join(poses) + "\n", encoding="utf-8")
+    assert_same(read_colmap(folder), scene)
+    torn = [poses[0], " ".join(["10", "20", "-1"] * 3 + ["30"]), *poses[1:]]
+    file.write_text("\n".join(torn) + "\n", encoding="utf-8")
+    with pytest.raises(CaptureError, match="line 2 should read"):
+        read_colmap(folder)
+
+
 def test_comments_may_stand_anywhere_in_text_models(tmp_path):
     scene = tiny_scene()
     folder = write_colmap(tmp_path, scene, text=True, images=None)

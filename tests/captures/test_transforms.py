@@ -141,6 +141,26 @@ def test_frames_in_no_list_are_left_out_and_told(tmp_path, scene):
     assert mine.warnings == ()
 
 
+@pytest.mark.parametrize("tested", ["val_filenames", "test_filenames", "test_frames"])
+def test_photographs_of_both_sides_only_test_and_are_told(tmp_path, scene, tested):
+    """Lists of nerfstudio that train on all, and frames of ScanNet++ that stand in both of its lists."""
+    content = write_transforms(tmp_path, scene)
+    names = [frame["file_path"] for frame in content["frames"]]
+    both = content["frames"][::4] if tested == "test_frames" else names[::4]
+    for lists in ({tested: both}, {"train_filenames": names, tested: both}):
+        if tested != "test_frames" and len(lists) == 1:
+            continue  # the other side takes the rest
+        (tmp_path / "transforms.json").write_text(json.dumps(content | lists))
+        capture = load_capture(tmp_path)
+        assert [f"images/{view.name}" for view in capture.test_views] == names[::4]
+        assert len(capture.train_views) == 9
+        assert capture.warnings == (
+            "images/frame_000.png, images/frame_004.png, images/frame_008.png: among the photographs for training and "
+            "among those for the test; only for the test, not for training (3 in all).",
+        )
+        assert load_capture(tmp_path, CaptureOptions(split="every")).warnings == ()
+
+
 @pytest.mark.parametrize(("key", "side"), [("train_filenames", "train"), ("test_filenames", "test")])
 def test_a_side_without_a_list_takes_the_frames_that_the_other_leaves(tmp_path, scene, key, side):
     names = sorted(scene.cameras)

@@ -225,6 +225,22 @@ def test_masks_are_counted(folder, scene):
     assert "Masks of 12 of 12 photographs; 50.0% masked out" in printed(capture, folder / "out")
 
 
+def test_gray_that_masks_leave_out_is_told(folder, scene):
+    """Mattes and numbers of classes, of which other programs keep all but 0; not what compression leaves at edges."""
+    write_masks(folder, scene.cameras)
+    names = sorted(scene.cameras)
+    write_masks(folder, names[3:5], left_out=60)
+    [said] = check_images(load_capture(folder)).warnings
+    assert f"{names[3]}: 50% of the mask is gray, from 1 to 127 of 255, and left out like black (2 of 12 masks" in said
+    ring = np.random.default_rng(0).integers(128, 255, (48, 64), np.uint8)
+    ring[:24], ring[23:25] = 0, 90
+    for name in names[3:5]:
+        cv2.imwrite(str(folder / "masks" / name), ring)
+    assert check_images(load_capture(folder)).warnings == ()
+    write_masks(folder, names, keep=1)
+    assert check_images(load_capture(folder)).warnings == ()
+
+
 def test_masks_of_some_photographs_are_a_warning(folder, scene):
     write_masks(folder, [*list(scene.cameras)[:1], "of_nothing.png"])
     capture = load_capture(folder)

@@ -139,6 +139,10 @@ def test_cameras_that_nothing_can_be_drawn_with_are_named(run):
         ("fx and fy must be above 0", {"fy": -80.0}),
         ("fx and fy must be above 0", {"fx": "80"}),
         ("fx and fy must be above 0", {"cx": np.nan}),
+        ("model must be pinhole or orthographic, not 'ortho'", {"model": "ortho"}),
+        ("model must be pinhole or orthographic, not 'fisheye'", {"model": "fisheye"}),
+        ("model must be pinhole or orthographic, not None", {"model": None}),
+        ("photograph_pixel must be a finite number", {"photograph_pixel": np.nan}),
     ):
         wrong = replace(camera, **changes)
         with pytest.raises(VdgsError, match=f"^camera: {said}"):
@@ -326,6 +330,37 @@ def test_a_scene_is_saved_and_read(run, tmp_path):
         loaded.cameras  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.PLY", "a.points.ply", "a.spz", "a.splat", "a.sog", "a.glb", "a.las", "a.html", "tileset.json"]
+)
+def test_a_model_is_saved_under_no_name_of_another_format(run, tmp_path, name):
+    with pytest.raises(VdgsError, match=rf"{name}: the name is that of .*vdgs\.export\(scene, path\) writes"):
+        run.scene.save(tmp_path / name)
+    assert not any(tmp_path.iterdir())
+
+
+def test_what_is_no_model_is_told_and_kept(run, native_small, tmp_path):
+    """Only of what a run wrote it is said to be deleted."""
+    vdgs.export(run, tmp_path / "scene.ply", sh_degree=0)
+    run.scene.save(tmp_path / "cut.safetensors")
+    whole = (tmp_path / "cut.safetensors").read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(whole[:-8])
+    (tmp_path / "flipped.safetensors").write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    for name in ("scene.ply", "cut.safetensors", "flipped.safetensors"):
+        with pytest.raises(VdgsError, match=rf"{name}: .*Give the model that Scene\.save or a run wrote") as said:
+            vdgs.Scene.load(tmp_path / name)
+        assert "elete" not in str(said.value)
+    for folder in (native_small.capture, native_small.whole):
+        with pytest.raises(VdgsError, match=r"is a folder, not a model\. vdgs\.open_run\(RUN\)\.scene"):
+            vdgs.Scene.load(folder)
+    stage = tmp_path / "coarse"
+    stage.mkdir()
+    (stage / "status.json").write_text("{}")
+    (stage / "model.safetensors").write_bytes(whole[:-8])
+    with pytest.raises(VdgsError, match="Delete it and run `vdgs run`"):
+        vdgs.Scene.load(stage / "model.safetensors")
+
+
 def test_a_run_whose_capture_is_gone_is_still_drawn(run, native_small, tmp_path, monkeypatch):
     import shutil
 
@@ -348,6 +383,8 @@ def test_what_does_not_work_is_said_before_any_work(capture, tmp_path):
         vdgs.train(capture, "fast")
     with pytest.raises(VdgsError, match="takes no Capture"):
         vdgs.train(capture, run_dir=tmp_path / "run")
+    with pytest.raises(VdgsError, match=r"capture_options say how a folder is read.*vdgs\.load_capture"):
+        vdgs.train(capture, capture_options=vdgs.CaptureOptions(downscale=4))
     with pytest.raises(VdgsError, match="takes no callbacks"):
         vdgs.train(capture.root, run_dir=tmp_path / "run", callbacks=[print])
     site = np.random.default_rng(8).uniform(0, 200, (500, 3))
@@ -390,6 +427,13 @@ def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_p
         r"export\.max_gaussians is -1; it must be": lambda: vdgs.export(run, tmp_path / "a.ply", max_gaussians=-1),
         "program is 'maya'": lambda: vdgs.export(run, tmp_path / "a.ply", program="maya"),
         "did you mean 'sh_degree'": lambda: vdgs.export(run, tmp_path / "a.ply", sh_degre=1),
+        "export has no 'run': the scene is": lambda: vdgs.export(run, tmp_path / "a.ply", run="bogus"),
+        "export has no 'output': `path`": lambda: vdgs.export(run, tmp_path / "a.ply", output=tmp_path / "b.ply"),
+        "export has no 'model': it is": lambda: vdgs.export(run, tmp_path / "a.ply", model="coarse"),
+        "export has no 'device': it is": lambda: vdgs.export(run, tmp_path / "a.ply", device="cpu"),
+        "export has no 'threads': vdgs": lambda: vdgs.export(run, tmp_path / "a.ply", threads=2),
+        "export has no 'evaluate': nothing": lambda: vdgs.export(run, tmp_path / "a.ply", evaluate=True),
+        r"view\.port is 99999; it must be at least 1": lambda: vdgs.view(run, port=99999),
         "rule is 'best'": lambda: vdgs.merge(run.scene, run.block_scenes, run.blocks, run.assignment, rule="best"),
         "model='block'": lambda: vdgs.open_run(run.path, model="block"),
         "did you mean 'downscale'": lambda: vdgs.load_capture(capture.root, downscal=2),
@@ -447,6 +491,8 @@ def test_wrong_kinds_of_arguments_are_named(capture, coarse):
         (lambda: vdgs.train(capture, callbacks=print), "callbacks must be .*Iterable, not builtin.*: give a list of"),
         (lambda: vdgs.train(capture, callbacks=[3]), "each of callbacks must be .*Callable, not int"),
         (lambda: vdgs.count_visibility(np.full((2, 3), "a"), cameras), "points must hold numbers, not <U1"),
+        (lambda: vdgs.Scene("scene.safetensors"), "model must be vdgs.AnchorModel, not str: vdgs.Scene.load"),
+        (lambda: vdgs.Scene(coarse.model, capture.root), "capture must be vdgs.Capture or .*: vdgs.load_capture"),
         (lambda: vdgs.train(capture.root, capture_options={}), "capture_options must be vdgs.CaptureOptions, not dict"),
     ):
         with pytest.raises(TypeError, match=name):

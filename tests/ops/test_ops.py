@@ -61,6 +61,24 @@ def test_the_loss_of_a_picture_is_zero_for_itself():
     assert bool(drawn.grad.abs().sum() > 0)
 
 
+@pytest.mark.parametrize("weight", [2.0, -1.0, float("nan"), "0.2"])
+def test_a_weight_of_the_loss_is_a_share(weight):
+    image = np.zeros((20, 20, 3), np.float32)
+    with pytest.raises(VdgsError, match=r"^ssim_weight is .*it must be"):
+        ops.photometric_loss(image, image.astype(np.uint8), ssim_weight=weight)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"lr": float("nan")}, {"lr": -1.0}, {"betas": (0.9, 1.0)}, {"betas": 0.9}, {"eps": -1e-8}], ids=str
+)
+def test_numbers_that_adam_cannot_step_by_are_named(wrong):
+    moved = [np.zeros((4, 3), np.float32) for _ in range(3)]
+    [name] = wrong
+    with pytest.raises(VdgsError, match=f"^{name} is .*it must be"):
+        ops.sparse_adam_(*moved, np.ones((4, 3), np.float32), None, 1, **({"lr": 0.1} | wrong))
+    assert not any(each.any() for each in moved)
+
+
 @pytest.mark.parametrize("kind", [torch.from_numpy, np.asarray], ids=["torch", "numpy"])
 def test_adam_moves_the_rows_that_it_is_given_as_torch_does(kind):
     start = np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3)

@@ -335,6 +335,14 @@ def test_numbers_that_are_not_whole_are_named(name, value):
         ops.rasterization(**scene(), **({"width": WIDTH, "height": HEIGHT} | {name: value}))
 
 
+@pytest.mark.parametrize("name", ["near_plane", "far_plane", "radius_clip", "eps2d"])
+def test_numbers_that_bound_nothing_are_named(name):
+    for wrong in (float("nan"), "1", None, *([-1.0] if name in ("radius_clip", "eps2d") else [])):
+        with pytest.raises(VdgsError, match=f"^{name} is '?{wrong}'?; it must be"):
+            draw(scene(), **{name: wrong})
+    assert torch.equal(draw(scene(), far_plane=float("inf"), radius_clip=torch.tensor(0))[0], draw(scene())[0])
+
+
 def test_sizes_may_be_whole_numbers_of_any_kind():
     given = scene()
     for width in (float(WIDTH), np.int64(WIDTH), torch.tensor(WIDTH)):

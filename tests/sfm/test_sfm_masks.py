@@ -129,6 +129,17 @@ def test_masks_of_nothing_and_of_other_shapes_are_named(tmp_path):
     assert len(collect_images([alone]).images) == 3  # of masks, at the carnival
 
 
+def test_gray_masks_are_told_before_work_begins(tmp_path):
+    photographs(tmp_path, *(f"{k}.jpg" for k in range(9)))
+    for k in range(9):
+        mask = write_mask(tmp_path / f"masks/{k}.png", left_half())
+    assert not collect_images([tmp_path]).notes
+    pixels = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
+    for k in range(9):
+        cv2.imwrite(str(tmp_path / f"masks/{k}.png"), np.maximum(pixels, 60))
+    assert any("44% of the mask is gray" in note for note in collect_images([tmp_path]).notes)
+
+
 def test_other_folders_of_masks_are_asked_of_captures_only(tmp_path):
     options = CaptureOptions(masks="legs")
     training = PRESETS["laptop"].training

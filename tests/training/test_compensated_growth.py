@@ -11,7 +11,7 @@ import torch
 from support.fake_gsplat import needs_gsplat
 from vdgs import ops
 from vdgs.config.method import CompensationConfig
-from vdgs.errors import UnsupportedOption
+from vdgs.errors import UnsupportedOption, VdgsError
 from vdgs.training.compensated_growth import CompensatedGrowth
 
 SIDE = 24
@@ -136,3 +136,31 @@ def test_what_does_not_fit_is_said():
     del params["quats"]
     with pytest.raises(ValueError, match="params lacks quats"):
         CompensatedGrowth().check_sanity(params, optimizers)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"gamma": float("nan")}, {"gamma": 2.0}, {"beta_g": -5.0}, {"t_low": 20.0}, {"t_low": "0.2"}, {"target": "max"},
+     {"min_draws": "none"}, {"enabled": "yes"}],
+    ids=str,
+)  # fmt: skip
+def test_a_compensation_that_does_not_work_is_said_when_it_is_given(wrong):
+    [name] = wrong
+    with pytest.raises(VdgsError, match=rf"^compensation\.{name} is .*it must be"):
+        CompensatedGrowth(compensation=CompensationConfig(**wrong))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"refine_every": 0}, {"reset_every": 0}, {"grow_grad2d": float("nan")}, {"prune_opa": -0.1}, {"seed": -1}],
+    ids=str,
+)
+def test_a_setting_that_does_not_work_is_said_when_it_is_given(wrong):
+    [name] = wrong
+    with pytest.raises(VdgsError, match=f"^{name} is .*it must be"):
+        CompensatedGrowth(**wrong)
+    assert CompensatedGrowth(prune_scale3d=float("inf"), refine_stop_iter=10**12).prune_scale3d == float("inf")
+    with pytest.raises(TypeError, match=r"compensation.*CompensationConfig"):
+        CompensatedGrowth(compensation={"t_low": 0.2})
+    with pytest.raises(VdgsError, match=r"^scene_scale is nan; it must be above 0"):
+        CompensatedGrowth().initialize_state(float("nan"))

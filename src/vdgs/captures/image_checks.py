@@ -11,7 +11,7 @@ import numpy as np
 
 from vdgs.captures.capture import Capture, View, spread_evenly
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.image_files import kept_fraction, verify_image
+from vdgs.captures.image_files import gray_fraction, gray_masks_note, kept_fraction, verify_image
 from vdgs.errors import CaptureError
 from vdgs.system.content_digests import find_copies
 
@@ -66,6 +66,8 @@ class _CheckedView:
     problem: str | None = None
     blank: bool = False
     kept: float = 1.0
+    #: `gray_fraction` of its mask.
+    gray: float = 0.0
 
 
 def check_images(
@@ -99,7 +101,10 @@ def check_images(
     masked = 1.0 - sum(view.kept for view in checked) / len(checked)
     shown = [view for view in views if view.name not in set(blank)]
     copies = [tuple(shown[k].name for k in group) for group in find_copies([view.image_path for view in shown])]
-    return ImageCheckReport(files, masked, tuple(_warnings(blank, masked, copies)))
+    shares = {
+        view.mask_path: each.gray for view, each in zip(views, checked, strict=True) if view.mask_path is not None
+    }
+    return ImageCheckReport(files, masked, tuple(_warnings(blank, masked, copies) + gray_masks_note(shares)))
 
 
 def _check_view(view: View) -> _CheckedView:
@@ -111,7 +116,8 @@ def _check_view(view: View) -> _CheckedView:
         kept = kept_fraction(view.image_path, view.mask_path, photograph.has_alpha_channel)
     except CaptureError as error:
         return _CheckedView(view.name, str(error))
-    return _CheckedView(view.name, None, not photograph.has_content, kept)
+    gray = 0.0 if view.mask_path is None else gray_fraction(view.mask_path)
+    return _CheckedView(view.name, None, not photograph.has_content, kept, gray)
 
 
 def _warnings(blank: list[str], masked: float, copies: list[tuple[str, ...]]) -> list[str]:

@@ -10,7 +10,7 @@ import io
 import os
 import threading
 import warnings as python_warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,6 +56,9 @@ MIN_SIDE_PX = 8
 ROUNDING_PX = 1.0
 #: A mask keeps what is at least so bright, of 255; an alpha channel what is at least so opaque (choice).
 MASK_THRESHOLD = 128
+#: A mask of more gray that is left out than this share of its pixels may be a matte or numbers of classes; compression
+#: and smooth edges make less (choice).
+MAX_GRAY_FRACTION = 0.05
 #: What programs put behind a photograph's name for that of its mask.
 _MASK_TAILS = ("_mask", ".mask", "-mask", "_msk")
 #: How instant-ngp's masks begin, which are white where others are black: at what is left out.
@@ -423,6 +426,29 @@ def _why_nothing(mask: Path, pixels: np.ndarray) -> str:
     brightest = int(light.max())
     hint = "Scale its values to 0 and 255" if brightest else "Turn it round if it is inverted"
     return f"White is kept, and the brightest value here is {brightest} of 255. {hint}"
+
+
+def gray_fraction(mask: Path) -> float:
+    """The share of a mask that is left out though it is not black; 0 where black is kept, where values are 0 and 1, and
+    where transparency says what is kept. Raises `CaptureError` for a mask that cannot be decoded."""
+    pixels = _decode(mask)
+    if mask.name.lower().startswith(DYNAMIC_MASK) or (pixels.ndim == 3 and pixels.shape[2] == 4):
+        return 0.0
+    light = _lightness(mask, pixels)
+    return float(((light > 0) & ~_kept(light)).mean())
+
+
+def gray_masks_note(shares: Mapping[Path, float]) -> list[str]:
+    """What to say of masks by their `gray_fraction`: nothing, unless one is more than compression leaves."""
+    gray = {mask: share for mask, share in shares.items() if share > MAX_GRAY_FRACTION}
+    if not gray:
+        return []
+    worst = max(gray, key=lambda mask: gray[mask])
+    return [
+        f"{worst}: {gray[worst]:.0%} of the mask is gray, from 1 to {MASK_THRESHOLD - 1} of 255, and left out like "
+        f"black ({len(gray)} of {len(shares)} masks looked at are so). Other programs keep all that is not black: "
+        "where that is meant, write 255 there."
+    ]
 
 
 def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral, Real
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import numpy as np
 
@@ -167,3 +167,9 @@ def check_camera(name: str, camera: object, remedy: str = "") -> None:
     lens = (camera.fx, camera.fy, camera.cx, camera.cy)
     if not (all(isinstance(each, Real) and math.isfinite(each) for each in lens) and min(lens[:2]) > 0):
         raise VdgsError(f"{name}: fx and fy must be above 0, and cx and cy finite numbers, not {lens}")
+    if camera.model not in get_args(CameraModel):
+        raise VdgsError(f"{name}: model must be {' or '.join(get_args(CameraModel))}, not {camera.model!r}")
+    if not (isinstance(camera.photograph_pixel, Real) and 0 <= camera.photograph_pixel < math.inf):
+        raise VdgsError(
+            f"{name}: photograph_pixel must be a finite number, at least 0, not {camera.photograph_pixel!r}"
+        )

@@ -123,13 +123,14 @@ class AnchorModel:
         write_atomic(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
-    def load(path: Path, *, checked: bool = True) -> AnchorModel:
-        """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model.
+    def load(path: Path, *, checked: bool = True, remedy: str = REBUILD_HINT) -> AnchorModel:
+        """Read a model. Raises VdgsError if the file is missing, damaged (`remedy` is what to do then) or not an anchor
+        model.
 
         Unless `checked`, numbers are neither read nor checked: they stay in the file, which is mapped, until they are
         used.
         """
-        tensors, header = read_tensors(path)
+        tensors, header = read_tensors(path, remedy)
         found = next((name for name in (ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT) if name in header), None)
         if found is None:
             raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {ANCHOR_MODEL_FORMAT!r})")
@@ -154,7 +155,7 @@ class AnchorModel:
             if checked:
                 model.check()
         except (KeyError, ValueError, TypeError) as error:
-            raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD_HINT}") from error
+            raise VdgsError(f"{path}: is damaged or incomplete ({error}). {remedy}") from error
         return model
 
     def check(self) -> None:

@@ -40,9 +40,26 @@ from vdgs.runs import open_run as runs
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StatusRecord
+from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.tensors import REBUILD_HINT
 
 _COLOR = Annotated[tuple[float, float, float], Range(0, 1)]
+#: Options of `vdgs export` that a scene in memory has no use for, and what to do instead.
+_NOT_OF_SCENES = {
+    "run": "the scene is the first argument",
+    "output": "`path` is the file; call it again for another one",
+    "model": "it is that of the scene: vdgs.open_run(RUN, model=...)",
+    "device": "it is that of the scene: vdgs.open_run(RUN, device=...)",
+    "threads": "vdgs.configure_threads sets them",
+    "evaluate": "nothing is reported here; `vdgs export` and `vdgs.render` tell what was lost",
+}
+
+
+#: What to do about a file that is no model and that no run wrote.
+_LOADABLE = (
+    "Give the model that Scene.save or a run wrote (model.safetensors); files of vdgs.export (.ply, .spz, ...) and of "
+    "other programs hold Gaussians and cannot be loaded."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +69,10 @@ class Scene:
     model: AnchorModel
     #: None where it is not known (`Scene.load`) or gone: such a scene is drawn, but not exported.
     capture: Capture | None = None
+
+    def __post_init__(self) -> None:
+        check_kind("model", self.model, AnchorModel, remedy="vdgs.Scene.load(FILE) reads one")
+        check_kind("capture", self.capture, Capture, type(None), remedy="vdgs.load_capture(FOLDER) reads one")
 
     def __len__(self) -> int:
         return len(self.model.anchors)
@@ -72,13 +93,29 @@ class Scene:
         return [view.camera for view in self.capture.train_views]
 
     def save(self, path: str | Path) -> None:
-        """Write the model as one safetensors file, atomically."""
-        self.model.save(home_path(path))
+        """Write the model as one safetensors file, atomically. Raises VdgsError for a name of a format of `export`."""
+        from vdgs.export.formats.registry import find_format
+
+        path = home_path(path)
+        other = find_format(path)
+        if other is not None:
+            raise VdgsError(
+                f"{path}: the name is that of {other.suffix} ({other.description}), which vdgs.export(scene, path) "
+                "writes. Let the name of a saved model end in .safetensors."
+            )
+        self.model.save(path)
 
     @staticmethod
     def load(path: str | Path, capture: Capture | None = None) -> Scene:
         """Read a model that `save` or a run wrote. Raises VdgsError for a missing, damaged or other file."""
-        return Scene(AnchorModel.load(home_path(path)), capture)
+        path = home_path(path)
+        if path.is_dir():
+            raise VdgsError(
+                f"{path}: is a folder, not a model. vdgs.open_run(RUN).scene is the scene of a run, and "
+                "vdgs.load_capture(FOLDER) reads a capture."
+            )
+        of_run = StageFolder(path.parent).status_file.is_file()
+        return Scene(AnchorModel.load(path, remedy=REBUILD_HINT if of_run else _LOADABLE), capture)
 
 
 class Run:
@@ -347,9 +384,9 @@ def merge(
 def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
     """Write a scene as Gaussians or points; the ending of `path` says how (.ply, .spz, .splat, .sog, .glb, .html, ...).
 
-    `options` are those of `vdgs export`: sh_degree=3, max_gaussians=0, crs="EPSG:25832", program="supersplat", ... The
-    file is that of `vdgs export`. Needs no screen. Raises VdgsError, before any Gaussian is baked, for a name or an
-    option that does not work and for a scene without its capture.
+    `options` are those of `vdgs export` that say what is in the file: sh_degree=3, max_gaussians=0, crs="EPSG:25832",
+    program="supersplat", ... The file is that of `vdgs export`. Needs no screen. Raises VdgsError, before any Gaussian
+    is baked, for a name or an option that does not work and for a scene without its capture.
     """
     from vdgs.export.export_run import resolve_request, write_files
 
@@ -357,6 +394,8 @@ def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
     _check_scene(scene)
     if scene.capture is None:
         raise VdgsError(f"{path}: baking needs the training cameras: give the capture, as in Scene(model, capture)")
+    for name in options.keys() & _NOT_OF_SCENES:
+        raise VdgsError(f"export has no {name!r}: {_NOT_OF_SCENES[name]}")
     paths = {"run": file.parent, "output": (file,), "evaluate": False}
     request = resolve_request(checked_settings(ExportRequest, options | paths, "export"))
     opened = runs.OpenedRun(
@@ -382,8 +421,8 @@ def train(
     iteration, iterations, loss, psnr in dB, anchors); one that returns True ends the stage early. With `run_dir` it is
     a run folder, which the same call continues after a crash; its blocks train in processes of their own, so it takes
     the capture's folder and no callbacks.
-    `capture_options` say how a folder is read. Raises CaptureError for a capture that cannot become a scene, VdgsError
-    for settings, TrainingDiverged.
+    `capture_options` say how a folder is read, and go with no `Capture`. Raises CaptureError for a capture
+    that cannot become a scene, VdgsError for settings, TrainingDiverged.
     """
     from vdgs.pipeline.train_in_memory import train_in_memory, train_in_run_folder
 
@@ -395,6 +434,11 @@ def train(
         check_kind("each of callbacks", callback, Callable)  # type: ignore[arg-type]
     options = CaptureOptions() if capture_options is None else capture_options
     settings = _checked_config("capture_options", options, CaptureOptions)
+    if capture_options is not None and isinstance(capture, Capture):
+        raise VdgsError(
+            "capture_options say how a folder is read, and this Capture is read already: give the folder, or the "
+            "options to vdgs.load_capture"
+        )
     device = select_device(device).device
     if run_dir is None:
         if isinstance(method, MethodConfig) and method.block.mask_moving == "on":
@@ -416,7 +460,9 @@ def view(run: Run | str | Path, *, host: str = "127.0.0.1", port: int | None = N
     from vdgs.viewer.server import view_run
 
     opened = run if isinstance(run, Run) else open_run(run)
-    view_run(ViewRequest(run=opened.path, model=opened.model, host=host, port=port, device=opened.device), Console())
+    address = {"host": host, "port": port}
+    request = {"run": opened.path, "model": opened.model, "device": opened.device} | address
+    view_run(checked_settings(ViewRequest, request, "view"), Console())
 
 
 def _warn(notes: Sequence[str]) -> None:

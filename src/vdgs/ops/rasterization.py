@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from vdgs.config.ranges import MAX_COUNT, Range
+from vdgs.config.ranges import MAX_COUNT, MAX_FLOAT, Range
 from vdgs.config.validation_rules import checked_value
 from vdgs.errors import UnsupportedOption
 from vdgs.geometry.camera import NEAR_PLANE, Camera, is_rigid_motion
@@ -44,6 +44,11 @@ UNSUPPORTED: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "rasterize_mode": (("classic", "antialiased"), "choose one of them"),
     "render_mode": (("RGB", "D", "ED", "RGB+D", "RGB+ED"), "choose one of them"),
 }
+#: What its other numbers may be: planes that bound depths (infinite ones bound none), px, and px² of variance.
+_NUMBERS: Mapping[str, Range] = {
+    "near_plane": Range(-math.inf, math.inf), "far_plane": Range(-math.inf, math.inf),
+    "radius_clip": Range(0, math.inf), "eps2d": Range(0, MAX_FLOAT),
+}  # fmt: skip
 
 
 def rasterization(
@@ -106,7 +111,8 @@ def rasterization(
     image's side off its center, as in crops, also within it.
 
     Raises ValueError for shapes that do not fit, TypeError for what is no tensor or array of float32, VdgsError for a
-    size or a degree that is no whole number, RuntimeError on the way back with `create_graph=True`, UnsupportedOption
+    size or a degree that is no whole number, a plane, a radius or an eps2d that is no number, and the latter two below
+    0, RuntimeError on the way back with `create_graph=True`, UnsupportedOption
     for absgrad, sparse_grad, distributed, fisheye and
     ftheta cameras, distortion, rolling shutter, `with_ut` and `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye
     et al. 2025 for the interface.
@@ -119,9 +125,12 @@ def rasterization(
     )
     if sh_degree is not None:
         sh_degree = checked_value("sh_degree", sh_degree, Annotated[int, Range(0, MAX_COUNT)])
+    near, far, radius_clip, eps2d = (
+        checked_value(name, given[name], Annotated[float, bounds]) for name, bounds in _NUMBERS.items()
+    )
     gaussians: _Gaussians = _check_gaussians(sh_degree, _tensors(given))
     settings = _Settings(
-        width=width, height=height, near=near_plane, far=far_plane, radius_clip=radius_clip, eps2d=eps2d,
+        width=width, height=height, near=near, far=far, radius_clip=radius_clip, eps2d=eps2d,
         antialiased=rasterize_mode == "antialiased", orthographic=camera_model == "ortho",
     )  # fmt: skip
     with torch.autocast(gaussians.means.device.type, enabled=False):  # the kernels compute in float32

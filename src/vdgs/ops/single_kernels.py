@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from numbers import Integral
-from typing import Generic, NamedTuple
+from typing import Annotated, Generic, NamedTuple
 
 from torch import Tensor
 
+from vdgs.config.ranges import FRACTION, MAX_FLOAT, Range
+from vdgs.config.validation_rules import checked_value
 from vdgs.errors import check_kind
 from vdgs.geometry.camera import Camera, check_camera
 from vdgs.kernels import get_backend
@@ -16,6 +18,8 @@ from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import cull_anchors
 from vdgs.model.renderer import decode_anchors as decode_rows
 from vdgs.ops.arrays import Array, check_image_index, in_place, like, to_torch
+
+_AT_LEAST_0 = Annotated[float, Range(0, MAX_FLOAT)]
 
 
 def cull(positions: Array, log_scales: Array, camera: Camera) -> Array:
@@ -74,8 +78,10 @@ def photometric_loss(
     """(1 - w) L1 + w (1 - SSIM) of an image [h, w, 3] float32 in [0, 1] and a target [h, w, 3] uint8, with L1 and SSIM.
 
     Pixels where `mask` [h, w] uint8 is 0 do not count. Only `loss` carries a gradient, by the image, computed with it.
-    Raises TypeError for other dtypes, ValueError for other shapes. Source: 3DGS eq. 7; Wang et al. 2004.
+    Raises TypeError for other dtypes, ValueError for other shapes, VdgsError for a weight w = `ssim_weight` that is not
+    from 0 to 1. Source: 3DGS eq. 7; Wang et al. 2004.
     """
+    ssim_weight = checked_value("ssim_weight", ssim_weight, Annotated[float, FRACTION])
     given, counted = to_torch("image", image), None if mask is None else to_torch("mask", mask)
     kernels, wanted = get_backend(given.device), to_torch("target", target)
     return like(image, kernels.photometric_loss(given, wanted, counted, ssim_weight=ssim_weight))
@@ -97,9 +103,12 @@ def sparse_adam_(
     moments, all float32, contiguous and writable; the others keep their values.
 
     `gradient` [v, ...] has a row for each of `rows`; `step` counts from 1, for all or [v] int32. Returns whether all
-    gradients were finite; if not, nothing changed. Raises TypeError or ValueError before any change. Source: Kingma and
-    Ba 2015, algorithm 1; rows as in Taming-3DGS.
+    gradients were finite; if not, nothing changed. Raises TypeError, ValueError or, for a rate that is no number at
+    least 0, betas that are not from 0 to below 1 and an eps below 0, VdgsError before any change. Source: Kingma and Ba
+    2015, algorithm 1; rows as in Taming-3DGS.
     """
+    lr, eps = (checked_value(name, value, _AT_LEAST_0) for name, value in (("lr", lr), ("eps", eps)))
+    betas = checked_value("betas", betas, Annotated[tuple[float, float], Range(0, 1, exclusive_max=True)])
     moments = in_place("first", first), in_place("second", second)
     state = AdamState(in_place("parameter", parameter), *moments, lr)
     chosen = None if rows is None else to_torch("rows", rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -12,7 +13,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vdgs.captures.image_files import decode_image, decode_mask, find_images, find_mask, read_header, same_aspect
+from vdgs.captures.image_files import (
+    decode_image,
+    decode_mask,
+    find_images,
+    find_mask,
+    gray_fraction,
+    gray_masks_note,
+    read_header,
+    same_aspect,
+)
 from vdgs.captures.mask_matching import mask_name
 from vdgs.captures.strays import MASK_FOLDERS, is_mask_folder, masked_stem
 from vdgs.config.capture_options import CaptureOptions
@@ -25,6 +35,8 @@ from vdgs.system.stop_signals import check_stop_requested
 
 #: What a folder of masks is called, and one of the photographs that it may lie beside, as in captures.
 MASK_FOLDER, IMAGE_FOLDER = CaptureOptions.masks, "images"
+#: So many masks of a set are looked at before work begins: they come from one program.
+_GRAY_SAMPLE = 3
 
 
 def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[Path, Path | None], list[str]]:
@@ -150,7 +162,16 @@ def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) ->
             f"{len(found) - len(without)} of {len(found)} photographs have a mask; the others, such as "
             f"{without[0].name}, count whole."
         )
-    return remarks
+    return remarks + gray_masks_note(_gray_fractions(sorted(used)))
+
+
+def _gray_fractions(masks: Sequence[Path]) -> dict[Path, float]:
+    """How much of some masks is gray and left out, spread over those that there are; damaged ones are said later."""
+    shares = dict[Path, float]()
+    for mask in masks[:: max(1, len(masks) // _GRAY_SAMPLE)][:_GRAY_SAMPLE]:
+        with suppress(CaptureError):
+            shares[mask] = gray_fraction(mask)
+    return shares
 
 
 def _named_from(folder: Path, photographs: Collection[Path]) -> str:

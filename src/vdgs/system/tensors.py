@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from vdgs.errors import VdgsError
+from vdgs.system.permissions import refusal
 
 #: The types that are written, in the order in which the format's library lays tensors out: wide ones first.
 DTYPES = {
@@ -25,7 +26,7 @@ DTYPES = {
 }  # fmt: skip
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
 _CHUNK = 1 << 20
-#: What to do about a model that cannot be used.
+#: What to do about a file of a run that cannot be used.
 REBUILD_HINT = "Delete it and run `vdgs run`, or the verb that made it, again: it is rebuilt."
 
 
@@ -55,15 +56,18 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
             file.write(_bytes_of(tensors[name].detach().contiguous()))
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """All tensors and the header of a safetensors file; VdgsError if it cannot be read."""
+def read_tensors(path: Path, remedy: str = REBUILD_HINT) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """All tensors and the header of a safetensors file; VdgsError if it cannot be read. `remedy` is what to do about
+    one that is damaged or of another kind: of a file that no run wrote, not to delete it."""
     try:
         with safe_open(path, framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
     except FileNotFoundError as error:
         raise VdgsError(f"{path}: is not there. Train first, or point to the right run.") from error
+    except PermissionError as error:
+        raise VdgsError(f"{path}: {refusal(path, error)}") from error
     except (OSError, SafetensorError, ValueError) as error:
-        raise VdgsError(f"{path}: cannot be read ({error}). {REBUILD_HINT}") from error
+        raise VdgsError(f"{path}: cannot be read ({error}). {remedy}") from error
 
 
 def read_tensors_unchecked(path: Path) -> dict[str, Tensor]:

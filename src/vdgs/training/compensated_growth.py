@@ -6,16 +6,20 @@ from cycle to cycle and added (eqs. 8-10, as `training.compensation` does for th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, MutableMapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vdgs.config.method import CompensationConfig
-from vdgs.errors import UnsupportedOption
+from vdgs.config.ranges import FRACTION, Range
+from vdgs.config.type_hints import field_hints
+from vdgs.config.validation_rules import checked_settings, checked_value
+from vdgs.errors import UnsupportedOption, check_kind
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.training.compensation import CompensationState, low_visibility_mask, update_cache
@@ -23,6 +27,8 @@ from vdgs.training.densification import CompensatedGradient
 
 #: A split Gaussian becomes two, so many times smaller (3DGS section 5.2).
 SPLIT_COUNT, SPLIT_SHRINK = 2, 1.6
+#: Thresholds and steps; infinite ones are never reached.
+_AT_LEAST_0, _AT_LEAST_1 = Range(0, math.inf), Range(1, math.inf)
 Params = MutableMapping[str, Any] | torch.nn.ParameterDict
 Optimizers = Mapping[str, torch.optim.Optimizer]
 
@@ -40,26 +46,40 @@ class CompensatedGrowth:
     c_k is the share of the images of a cycle (between two decisions) that the center of Gaussian k lies in, counted at
     what was drawn: an image that is drawn twice counts twice (choice). `compensation.min_draws` plays no part: gsplat
     has no gate. Gradients are in NDC units, as in 3DGS.
+
+    Raises VdgsError for a setting of another kind or outside its range, TypeError for another `compensation`.
     """
 
-    prune_opa: float = 0.005
-    grow_grad2d: float = 0.0002
-    grow_scale3d: float = 0.01
-    prune_scale3d: float = 0.1
-    refine_start_iter: int = 500
-    refine_stop_iter: int = 15_000
-    reset_every: int = 3000
-    refine_every: int = 100
-    pause_refine_after_reset: int = 0
+    prune_opa: Annotated[float, FRACTION] = 0.005
+    grow_grad2d: Annotated[float, _AT_LEAST_0] = 0.0002
+    grow_scale3d: Annotated[float, _AT_LEAST_0] = 0.01
+    prune_scale3d: Annotated[float, _AT_LEAST_0] = 0.1
+    refine_start_iter: Annotated[int, _AT_LEAST_0] = 500
+    refine_stop_iter: Annotated[int, _AT_LEAST_0] = 15_000
+    reset_every: Annotated[int, _AT_LEAST_1] = 3000
+    refine_every: Annotated[int, _AT_LEAST_1] = 100
+    pause_refine_after_reset: Annotated[int, _AT_LEAST_0] = 0
     absgrad: bool = False
     revised_opacity: bool = False
     verbose: bool = False
     compensation: CompensationConfig = field(default_factory=CompensationConfig)
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Of the places of split Gaussians."""
 
+    def __post_init__(self) -> None:
+        """Check what a caller gave as `vdgs.train` checks its settings."""
+        check_kind("compensation", self.compensation, CompensationConfig, remedy="vdgs.CompensationConfig(t_low=0.2)")
+        checked_settings(CompensationConfig, asdict(self.compensation), "compensation")
+        kind: type = type(self)
+        for name, hint in field_hints(kind).items():
+            if name != "compensation":
+                setattr(self, name, checked_value(name, getattr(self, name), hint))
+
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """The running state, to be passed to the other functions. `scene_scale`: extent of the scene, world units."""
+        """The running state, to be passed to the other functions. `scene_scale`: extent of the scene, world units.
+        Raises VdgsError for one that is no number above 0."""
+        bounds = Range(0, math.inf, exclusive_min=True)
+        scene_scale = checked_value("scene_scale", scene_scale, Annotated[float, bounds])
         generator = torch.Generator().manual_seed(self.seed)
         return {"grad2d": None, "count": None, "seen": None, "cache": None, "views": 0, "scene_scale": scene_scale,
                 "generator": generator}  # fmt: skip

@@ -21,6 +21,8 @@ from vdgs.captures.formats.colmap_records import (
 from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics
 from vdgs.errors import CaptureError
 
+#: How far from 1 the length of a quaternion may be, as programs round it.
+_UNIT_TOLERANCE = 1e-3
 _NO_NUMBER = re.compile(r"[+-]?(?:nan|inf)\(.*\)|[+-]?1\.#\w+", re.IGNORECASE)
 
 
@@ -96,16 +98,23 @@ def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapIma
 
 
 def _is_pose(line: str) -> bool:
-    """Whether a line is the pose of another image, which ends in a name, where points are expected."""
+    """Whether a line is the pose of another image, which ends in a name, where points are expected. Where the name is a
+    number too, a quaternion of length 1 says so, and that the line has no three numbers for each point."""
     words = line.split(maxsplit=9)
-    try:
-        _ = int(words[0]), int(words[8]), [_number(word) for word in words[1:8]]
-        float(words[9].split()[0])
-    except IndexError:
+    if len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
         return False
+    name = words[9].split()
+    try:
+        quaternion, _ = [_number(word) for word in words[1:5]], [_number(word) for word in words[5:8]]
+        float(name[0])
     except ValueError:
-        return len(words) == 10 and words[0].isdecimal() and words[8].isdecimal()
-    return False
+        return True
+    if not abs(math.hypot(*quaternion) - 1.0) < _UNIT_TOLERANCE:
+        return False
+    try:
+        return len([float(word) for word in name]) % 3 != 0
+    except ValueError:
+        return True
 
 
 def _triples(file: Path, number: int, line: str) -> np.ndarray:

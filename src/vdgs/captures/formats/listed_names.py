@@ -22,7 +22,7 @@ def find_listed(
     """
     if not names:
         return set(), []
-    lookup = NameLookup((name, name) for name in names)
+    lookup = NameLookup((name, name) for name in dict.fromkeys(names))
     found = {line: lookup.find(line)[1] for line in written}
     for line, meant in found.items():
         if len(meant) > 1:

@@ -185,8 +185,15 @@ def without_tested(views: list[SourceView], tested: Collection[str]) -> tuple[li
     these."""
     kept = [view for view in views if view.split == "test" or view.name not in tested]
     both = [view.name for view in views if view.split != "test" and view.name in tested]
+    return kept, tested_only(both)
+
+
+def tested_only(both: Sequence[str]) -> list[str]:
+    """What to say of photographs that a set names for training and for the test."""
+    if not both:
+        return []
     said = "among the photographs for training and among those for the test; only for the test, not for training"
-    return kept, [f"{first_names(both)}: {said}."] if both else []
+    return [f"{first_names(both)}: {said} ({len(both)} in all)."]
 
 
 def leave_out_bad_poses(bad: Mapping[str, CaptureError], count: int, file: Path, strict: bool = False) -> list[str]:

@@ -34,6 +34,7 @@ from vdgs.captures.formats.source_capture import (
     refuse_lost_tests,
     refuse_many_missing,
     safe_name,
+    tested_only,
     to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
@@ -86,7 +87,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     count, frames = len(frames), [*frames, *held_out]
     photographs = _find_photographs([_file_path(frame, file) for frame in frames], file, root, options)
     names, chosen, notes = photographs.names, photographs.folder, photographs.notes
-    splits = _splits(content, names, names[count:], file, options, notes)
+    splits = _splits(content, names, count, file, options, notes)
     applied = _parse_applied(content, file)
     views, poses, missing, lost = list[SourceView](), dict[str, np.ndarray](), list[str](), list[str]()
     bad = dict[str, CaptureError]()
@@ -195,27 +196,32 @@ def _image_folder(root: Path, named: str, options: CaptureOptions) -> tuple[str,
 
 
 def _splits(
-    content: JsonObject, names: list[str], held_out: list[str], file: Path, options: CaptureOptions, notes: list[str]
+    content: JsonObject, names: list[str], count: int, file: Path, options: CaptureOptions, notes: list[str]
 ) -> dict[str, Split]:
-    """Splits of frames (`names`) where some are test_frames (`held_out`), or where train_filenames and val_filenames or
-    test_filenames are given.
+    """Splits of frames (`names`) where those behind the first `count` are test_frames, or where train_filenames and
+    val_filenames or test_filenames are given.
 
-    Frames in no list have none; where one side has no list at all, it takes them (choice). Raises `CaptureError`
-    where a list that is not ignored names no frame.
+    Frames in no list have none; where one side has no list at all, it takes them (choice). What is listed on both sides
+    is for the test, which the notes say where the lists count. Raises `CaptureError` where a list that is not ignored
+    names no frame.
     """
-    splits: dict[str, Split] = dict.fromkeys(held_out, "test")
-    sides_listed: set[Split] = {"test"} if held_out else set()
+    held_out = set(names[count:])
+    listed: dict[Split, set[str]] = {"train": held_out.intersection(names[:count]), "test": held_out}
+    sides: set[Split] = {"test"} if held_out else set()
     for key, side in SPLIT_LISTS:
-        listed = content.get(key) or []
-        if not isinstance(listed, list):
+        written = content.get(key) or []
+        if not isinstance(written, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
-        if listed and options.split != "every":
-            found, unknown = find_listed(list(map(str, listed)), names, f"{file}: {key}", strict=options.strict)
-            splits.update(dict.fromkeys(found, side))
-            sides_listed.add(side)
+        if written and options.split != "every":
+            found, unknown = find_listed(list(map(str, written)), names, f"{file}: {key}", strict=options.strict)
+            listed[side] = listed[side] | found
+            sides.add(side)
             notes += unknown
-    if len(sides_listed) == 1:
-        rest: Split = "train" if "test" in sides_listed else "test"
+    if options.test_list is None and options.split in ("auto", "explicit"):
+        notes += tested_only(sorted(listed["train"] & listed["test"]))
+    splits = {name: side for side, found in listed.items() for name in found}  # what is in both becomes "test"
+    if len(sides) == 1:
+        rest: Split = "train" if "test" in sides else "test"
         return {name: splits.get(name, rest) for name in names}
     return splits
 

@@ -201,12 +201,20 @@ FORMATS: tuple[ExportFormat, ...] = (
 )
 
 
-def format_from_path(path: Path) -> ExportFormat:
-    """The format that a file's name asks for. Raises VdgsError, naming those there are, for any other."""
+def find_format(path: Path) -> ExportFormat | None:
+    """The format that a file's name asks for; None for a name of no format."""
     name = path.name.lower()
     for each in FORMATS:
         if name == each.suffix if each.folder else name.endswith(each.suffix) and name != each.suffix:
             return each
+    return None
+
+
+def format_from_path(path: Path) -> ExportFormat:
+    """The format that a file's name asks for. Raises VdgsError, naming those there are, for any other."""
+    found = find_format(path)
+    if found is not None:
+        return found
     known = ", ".join(f"{each.suffix} ({each.description})" for each in FORMATS)
     raise VdgsError(f"{path}: no format is known by this name. Let it end in one of: {known}.")
 
