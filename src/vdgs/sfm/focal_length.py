@@ -140,8 +140,9 @@ def _framing(details: Mapping[int, Any], xmp: Mapping[str, str], width: int, hei
     crop, odd = read_raw_crop(xmp, width, height, whole)
     if crop is not None:
         original *= crop.part if abs(crop.part * original / longer - 1) < CUT else 1.0
-        said = f"cropped by a program to {crop.part:.0%} of the longer side (crs:HasCrop in XMP); its focal length too"
-        return _Framing(original, (crop.shape * WHOLE_PX, WHOLE_PX), part=crop.part, remark=said)
+        said = f"cropped by a program (crs:HasCrop in XMP), to {crop.part:.0%} of the longer side"
+        sides = crop.shape * WHOLE_PX, WHOLE_PX
+        return _Framing(original, sides, part=crop.part, remark=f"{said}; the focal length is counted for that")
     if cut:  # a picture that was cut has fewer pixels, of the same size
         sides = _number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0
         return _Framing(original, sides, original / longer, remark=unclear, doubt=odd)
