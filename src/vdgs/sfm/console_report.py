@@ -88,9 +88,11 @@ def _positions_text(preflight: PreflightReport) -> str:
     if not preflight.positions or preflight.spread_m is None:
         return "none: the scale will be arbitrary, north unknown"
     east, north = preflight.spread_m
-    rtk = f"; {preflight.rtk} say how accurate they are (RTK)" if preflight.rtk else ""
+    accurate = f"; {preflight.accurate} say how accurate they are" if preflight.accurate else ""
+    accurate += " (RTK)" if preflight.rtk else ""
     spread = f"over {east:.0f} m x {north:.0f} m"
-    return f"{preflight.positions} of {preflight.num_images}, {spread}; altitude: {preflight.altitude_reference}{rtk}"
+    placed = f"{preflight.positions} of {preflight.num_images}, {spread}"
+    return f"{placed}; altitude: {preflight.altitude_reference}{accurate}"
 
 
 def _several(values: list[str]) -> str:

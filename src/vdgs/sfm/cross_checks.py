@@ -18,7 +18,7 @@ from vdgs.sfm.brackets import SAME_STOPS
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
-from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
+from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata, looks_backwards
 from vdgs.sfm.rig_folders import may_be_sensor
 
 #: Focal lengths within this share of each other are one.
@@ -70,7 +70,7 @@ def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
     changed = {
         photo.name: photo
         for group in groups.values()
-        for photo in _without_defaults(_one_altitude(_cropped(_zoom_once(_without_void(group)))))
+        for photo in _without_defaults(_one_convention(_one_altitude(_cropped(_zoom_once(_without_void(group))))))
     }
     return [changed[photo.name] for photo in photographs]
 
@@ -188,6 +188,13 @@ def _one_altitude(group: list[ImageMetadata]) -> list[ImageMetadata]:
                     altitude = in_xmp[0] + float(np.median(apart or [0.0]))
                 found[k] = replace(group[k], altitude=altitude, altitude_type=kind.most_common(1)[0][0])
     return found
+
+
+def _one_convention(group: list[ImageMetadata]) -> list[ImageMetadata]:
+    """Attitudes under Pix4D's names all as Pix4D defines them, or all as gimbals measure them, as the photographs of
+    the camera tell together: pitches above -30 degrees may be either."""
+    backwards = looks_backwards(*(photo.attitudes for photo in group if photo.attitudes))
+    return [replace(photo, attitude=photo.attitudes[backwards]) if photo.attitudes else photo for photo in group]
 
 
 def _without_defaults(group: list[ImageMetadata]) -> list[ImageMetadata]:

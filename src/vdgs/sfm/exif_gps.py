@@ -151,7 +151,7 @@ def _measured(value: float | None, absolute: float | None, xmp: Mapping[str, str
         return None, ""
     if value < LOWEST_M:
         return -value, "EXIF GPSAltitude, whose mark 'below sea level' cannot be true"
-    ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, "AltitudeType", "Camera:VertCS")
+    ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, "AltitudeType", "VertCS", "VERTCRS")
     if ellipsoidal is not None and abs(ellipsoidal - value) < SAME_M:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
     if absolute and abs(value - absolute) >= OTHER_M:  # what XMP names is its own

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vdgs.sfm.exif_gps import plain_text
+from vdgs.sfm.raw_crops import USUAL_SHAPES, read_raw_crop
 from vdgs.sfm.xmp import first_number, text
 
 #: Sensors in millimetres across and down, of cameras that do not say it in EXIF, or say nothing else, by EXIF's model.
@@ -42,8 +43,10 @@ SENSOR, EQUIVALENT = "EXIF's focal length and sensor", "EXIF's 35 mm equivalent"
 AGREE = 1.25
 #: Sides of a picture whose proportions differ by more than this share were cut.
 CUT = 0.02
-#: Shapes that programs export: longer side over shorter.
-USUAL_SHAPES = (16 / 9, 3 / 2, 4 / 3, 1.0)
+#: No sensor of a camera has pixels that are wider (millimetres; thermal ones have up to 0.05).
+MAX_PIXEL_MM = 0.08
+#: The shorter side of a whole picture whose pixels are not known; the shape alone counts.
+WHOLE_PX = 3000.0
 #: Programs that shrink photographs leave less of them than this share of the longer side (choice).
 MAX_SHRUNK = 0.6
 #: Programs that write photographs anew, by what they call themselves.
@@ -85,19 +88,19 @@ def read_lens(
 
     Each is held against the others, and what contradicts most of them is not taken.
     """
-    longer = max(width, height)
-    original, cut, unclear = _original(details, width, height)
+    longer, frame = max(width, height), _framing(details, xmp, width, height)
+    original, part = frame.original, frame.part
     model, zoom = _model(tags), _zoom(details)
+    kept = zoom * frame.kept
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
-    kept = zoom * (original / longer if cut else 1.0)  # a picture that was cut has fewer pixels, of the same size
-    sides = (_number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0) if cut else (width, height)
+    in_table = _by_sensor(focal_mm, _used_width(model, *frame.sides))
     measured = [
-        (_times(_calibrated(xmp, original), kept), CALIBRATED_SOURCE),
+        (_times(_calibrated(xmp, original, part), kept), CALIBRATED_SOURCE),
         (_times(_by_sensor(focal_mm, _sensor(details, original)), kept), SENSOR),
-        (_times(_by_sensor(focal_mm, _used_width(model, *sides)), kept), f"EXIF's focal length, the sensor of {model}"),
-        (_times(_by_pix4d(xmp, _sensor(details, original), original), kept), PIX4D_SOURCE),
+        (_times(in_table, kept / part), f"EXIF's focal length, the sensor of {model}"),
+        (_times(_by_pix4d(xmp, _sensor(details, original), original, part), kept), PIX4D_SOURCE),
     ]
-    equivalent = as_written = _times(_by_equivalent(equivalent_mm, *sides), kept / zoom)
+    equivalent = as_written = _times(_by_equivalent(equivalent_mm, *frame.sides), frame.kept / part)
     equivalent = _zoomed_equivalent(equivalent, [focal for focal, _ in measured], zoom)
     ways = [*measured, (equivalent, EQUIVALENT)]
     known = [(focal, source) for focal, source in ways if focal and MIN_FOCAL < focal < MAX_FOCAL]
@@ -105,12 +108,49 @@ def read_lens(
         return None
     focal, source, doubt = _agreed(known, longer, copied=equivalent_mm == focal_mm)
     agreeing = {_witness(how) for other, how in known if alike(focal, other)}
-    remark = unclear if cut else "" if len(agreeing) > 1 else _rewritten(tags, xmp, source, original, longer)
+    alone = len(agreeing) == 1
+    remark = _joined(frame.remark, _rewritten(tags, xmp, source, original, longer) if alone else "")
     zoom_confirmed = as_written is not None and alike(as_written, focal) and not alike(as_written, focal / zoom)
-    if unclear and not cut:
-        doubt = "; ".join(filter(None, (unclear, doubt)))
+    doubt = _joined(frame.doubt, _coarse_pixels(details) if alone and source == SENSOR else "", doubt)
     counted = 1.0 if source == EQUIVALENT else zoom
-    return Lens(focal, source, doubt, counted, zoom, focal_mm, zoom_confirmed, remark, confirmed=len(agreeing) > 1)
+    return Lens(focal, source, doubt, counted, zoom, focal_mm, zoom_confirmed, remark, confirmed=not alone)
+
+
+@dataclass(frozen=True)
+class _Framing:
+    """What of the picture that the camera took is left."""
+
+    original: float
+    """Pixels of the longer side of what is left, as the camera took them."""
+    sides: tuple[float, float]
+    """Of the picture that the size of the sensor and the 35 mm equivalent are of."""
+    kept: float = 1.0
+    """Pixels of the original over those that are left."""
+    part: float = 1.0
+    """The longer side of what is left over that of the picture that the tags are of, where a program cropped it."""
+    remark: str = ""
+    doubt: str = ""
+
+
+def _framing(details: Mapping[int, Any], xmp: Mapping[str, str], width: int, height: int) -> _Framing:
+    """By the crop that a program says; else by EXIF's size."""
+    longer = max(width, height)
+    original, cut, unclear = _original(details, width, height)
+    whole = _calibrated_width(xmp) or (original if original > longer else None)
+    crop, odd = read_raw_crop(xmp, width, height, whole)
+    if crop is not None:
+        original *= crop.part if abs(crop.part * original / longer - 1) < CUT else 1.0
+        said = f"cropped by a program (crs:HasCrop in XMP), to {crop.part:.0%} of the longer side"
+        sides = crop.shape * WHOLE_PX, WHOLE_PX
+        return _Framing(original, sides, part=crop.part, remark=f"{said}; the focal length is counted for that")
+    if cut:  # a picture that was cut has fewer pixels, of the same size
+        sides = _number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0
+        return _Framing(original, sides, original / longer, remark=unclear, doubt=odd)
+    return _Framing(original, (width, height), doubt=_joined(unclear, odd))
+
+
+def _joined(*said: str) -> str:
+    return "; ".join(filter(None, said))
 
 
 def unzoomed(lens: Lens) -> Lens:
@@ -224,29 +264,35 @@ def _model(tags: Mapping[int, Any]) -> str:
     return value.strip("\x00 ").upper() if isinstance(value, str) else ""
 
 
-def _calibrated(xmp: Mapping[str, str], original: float) -> float | None:
-    """DJI: DewarpData is `date;fx,fy,cx,cy,...` in pixels of the original, CalibratedFocalLength is fx alone. Pix4D's
-    matrix of fisheyes counts angles in quarter turns."""
+def _calibrated_width(xmp: Mapping[str, str]) -> float | None:
+    """The pixels across that a maker's calibration is of: it meets the sensor near its middle."""
+    return _times(first_number(xmp, "CalibratedOpticalCenterX", "CalibratedOpticalCenter:X"), 2)
+
+
+def _calibrated(xmp: Mapping[str, str], original: float, part: float) -> float | None:
+    """DJI: DewarpData is `date;fx,fy,cx,cy,...` in pixels of the original, CalibratedFocalLength is fx alone (Skydio: a
+    structure). Pix4D's matrix of fisheyes counts angles in quarter turns. Of the original a `part` was left."""
     words = text(xmp, "DewarpData").partition(";")[2].split(",")
     try:
         focal = float(words[0])
     except ValueError:
         focal = (
-            first_number(xmp, "CalibratedFocalLength") or 2 / math.pi * _numbers(xmp, "Camera:FisheyeAffineMatrix")[0]
+            first_number(xmp, "CalibratedFocalLength", "CalibratedFocalLength:X")
+            or 2 / math.pi * _numbers(xmp, "Camera:FisheyeAffineMatrix")[0]
         )
-    middle = first_number(xmp, "CalibratedOpticalCenterX")
-    if middle and not 1 / AGREE < 2 * middle / original < AGREE:
-        original = 2 * middle  # a program that shrank the photograph wrote its new size into EXIF
+    width = _calibrated_width(xmp)
+    if width and (part < 1 or not 1 / AGREE < width / original < AGREE):
+        original = width * part  # a program that shrank the photograph wrote its new size into EXIF
     return focal / original if math.isfinite(focal) and focal > 0 else None
 
 
-def _by_pix4d(xmp: Mapping[str, str], sensor_mm: float | None, original: float) -> float | None:
+def _by_pix4d(xmp: Mapping[str, str], sensor_mm: float | None, original: float, part: float) -> float | None:
     """Pix4D's names: millimetres, unless the unit is another (pixels), and where the view meets the sensor, near the
-    middle of its width."""
+    middle of its width, of which a `part` was left."""
     focal = _numbers(xmp, "Camera:PerspectiveFocalLength")[0]
     if text(xmp, "Camera:PerspectiveFocalLengthUnits").lower() not in ("", "mm"):
         return focal / original
-    return _by_sensor(focal, sensor_mm or 2 * _numbers(xmp, "Camera:PrincipalPoint")[0])
+    return _by_sensor(focal, sensor_mm or 2 * part * _numbers(xmp, "Camera:PrincipalPoint")[0])
 
 
 def _numbers(xmp: Mapping[str, str], name: str) -> list[float]:
@@ -261,7 +307,27 @@ def _numbers(xmp: Mapping[str, str], name: str) -> list[float]:
 def _sensor(details: Mapping[int, Any], original: float) -> float | None:
     """Width of the sensor in millimetres, from EXIF's pixels per inch (centimetre, millimetre) on it."""
     density, unit = _number(details.get(0xA20E)), details.get(0xA210, 2)
-    return original / density * _UNITS[unit] if density and unit in _UNITS else None
+    if not density or unit not in _UNITS:
+        return None
+    return density * _UNITS[unit] if _is_width(details) else original / density * _UNITS[unit]
+
+
+def _is_width(details: Mapping[int, Any]) -> bool:
+    """Whether EXIF's density of pixels is the size of the sensor (FLIR's Duo Pro R: 10.88 and 8.704 mm): no pixel is so
+    wide, and none is so far from square."""
+    across, down = _number(details.get(0xA20E)), _number(details.get(0xA20F))
+    return bool(_coarse_pixels(details)) and not (across and down and abs(across / down - 1) < CUT)
+
+
+def _coarse_pixels(details: Mapping[int, Any]) -> str:
+    """What to say of a density that no sensor has."""
+    density, unit = _number(details.get(0xA20E)), details.get(0xA210, 2)
+    if not density or unit not in _UNITS or _UNITS[unit] / density <= MAX_PIXEL_MM:
+        return ""
+    return (
+        f"EXIF's FocalPlaneXResolution ({density:g}) would be pixels of {1000 * _UNITS[unit] / density:.0f} \u00b5m, "
+        "which no sensor has; the focal length is a guess"
+    )
 
 
 def _used_width(model: str, width: float, height: float) -> float | None:

@@ -79,17 +79,34 @@ NEARLY_DOWN_DEG = 20.0
 #: In Pix4D's XMP a pitch of 0 looks down and 90 ahead. Below this (degrees) the gimbal's own angle was written there:
 #: cameras do not look backwards.
 _BACKWARDS_DEG = -30.0
+#: Drones that write the gimbal's own angles under Pix4D's names, by EXIF's model: Autel's EVO Lite 640T.
+_GIMBALS_UNDER_PIX4D = ("XL715",)
 
 
 def read_attitude(xmp: Mapping[str, str]) -> tuple[Attitude | None, str]:
     """Where the camera looked, or None, and what people should know of it.
 
-    By the gimbal (DJI and those who write as it does, Parrot, Skydio), by Pix4D's names, or by the aircraft that the
-    camera is fixed to, which looks down when level (senseFly). Angles that are all exactly 0 are those of a program
-    that knew none.
+    By the gimbal (DJI and those who write as it does, Parrot, Skydio, Yuneec), or as a body that looks down when level:
+    Pix4D's names, and the aircraft that the camera is fixed to (senseFly). Angles that are all exactly 0 are those of a
+    program that knew none.
     """
-    for names, from_gimbal in _WAYS:
-        yaw, pitch, roll = (first_number(xmp, *each) for each in names)
+    both, said = _read_attitudes(xmp)
+    return (both[looks_backwards(both)] if both else None), said
+
+
+def looks_backwards(*both: tuple[Attitude, Attitude]) -> bool:
+    """Whether the second of each pair holds, where the first is what Pix4D defines and the second is what gimbals
+    measure: as many cameras would look backwards by the first as would look up by the second."""
+    pitches = [as_gimbal.tilt_deg - 90 for _, as_gimbal in both]
+    backwards = sum(pitch < _BACKWARDS_DEG for pitch in pitches)
+    return 0 < backwards >= sum(pitch > 0 for pitch in pitches)
+
+
+def _read_attitudes(xmp: Mapping[str, str]) -> tuple[tuple[Attitude, Attitude] | None, str]:
+    """Where the camera looked, as the names define the angles and as some drones write them under these names; one
+    and the same mostly."""
+    for names, *ways in _WAYS:
+        yaw, pitch, roll = (first_number(xmp, name) for name in names)
         if pitch is None:
             continue
         if not yaw and not pitch and not roll:
@@ -98,25 +115,23 @@ def read_attitude(xmp: Mapping[str, str]) -> tuple[Attitude | None, str]:
             continue
         if yaw is None:
             yaw = first_number(xmp, "FlightYawDegree", "DroneYawDegree", "GPSImgDirection")
-        attitude = from_gimbal(yaw or 0.0, pitch, roll or 0.0)
-        return (attitude, "") if yaw is not None or attitude.tilt_deg < NEARLY_DOWN_DEG else (None, "")
+        read = [from_angles(yaw or 0.0, pitch, roll or 0.0) for from_angles in ways]
+        both = read[0], read[-1]
+        known = yaw is not None or both[looks_backwards(both)].tilt_deg < NEARLY_DOWN_DEG
+        return (both if known else None), ""
     return None, ""
 
 
-def _by_pix4d(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Attitude:
-    return attitude_from_gimbal(yaw_deg, pitch_deg if pitch_deg < _BACKWARDS_DEG else pitch_deg - 90, roll_deg)
-
-
-_WAYS = (
-    ((("GimbalYawDegree",), ("GimbalPitchDegree",), ("GimbalRollDegree",)), attitude_from_gimbal),
-    ((("CameraYawDegree",), ("CameraPitchDegree",), ("CameraRollDegree",)), attitude_from_gimbal),
-    (
-        (("CameraOrientationNED:Yaw",), ("CameraOrientationNED:Pitch",), ("CameraOrientationNED:Roll",)),
-        attitude_from_gimbal,
-    ),
-    ((("sensefly:Heading",), ("sensefly:PitchAngle",), ("sensefly:RollAngle",)), attitude_from_aircraft),
-    ((("Camera:Yaw",), ("Camera:Pitch",), ("Camera:Roll",)), _by_pix4d),
-)  # fmt: skip
+_WAYS: tuple[tuple[Any, ...], ...] = (
+    (("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"), attitude_from_gimbal),
+    (("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"), attitude_from_gimbal),
+    (("CameraOrientationNED:Yaw", "CameraOrientationNED:Pitch", "CameraOrientationNED:Roll"), attitude_from_gimbal),
+    (("drone-yuneec:GimbalYaw", "drone-yuneec:GimbalPitch", "drone-yuneec:GimbalRoll"), attitude_from_gimbal),
+    (("xmp:CameraYaw", "xmp:CameraPitch", "xmp:CameraRoll"), attitude_from_gimbal),  # Yuneec's CGO3+
+    (("sensefly:Heading", "sensefly:PitchAngle", "sensefly:RollAngle"), attitude_from_aircraft),
+    (("sensefly:Yaw", "sensefly:Pitch", "sensefly:Roll"), attitude_from_aircraft),
+    (("Camera:Yaw", "Camera:Pitch", "Camera:Roll"), attitude_from_aircraft, attitude_from_gimbal),
+)
 
 
 #: A shorter side below this shows too little to be matched: a thumbnail.
@@ -131,6 +146,8 @@ NOT_CORRECTED, UNCORRECTED_M = (0.0, 16.0), 0.3
 RADIAL, FISHEYE = "SIMPLE_RADIAL", "OPENCV_FISHEYE"
 #: The model of cameras of which nothing is fitted: of views that were cut out of panoramas.
 EXACT_MODEL = "SIMPLE_PINHOLE"
+#: XMP's names for the height over the take-off: DJI's and its followers', senseFly's, Yuneec's, MAVLink's by FLIR.
+_OVER_TAKE_OFF = ("RelativeAltitude", "sensefly:Height", "drone-yuneec:AboveHomeAltitude", "FLIR:MAVRelativeAltitude")
 #: What cameras are called that do not say what they are.
 UNKNOWN_CAMERA = "unknown camera"
 
@@ -202,6 +219,8 @@ class ImageMetadata:
     """What EXIF says against its position or altitude: `VOID`, `FLAT`; empty for nothing."""
     subsecond: float | None = None
     """The part of the second of `datetime`, where EXIF says it (SubSecTimeOriginal)."""
+    attitudes: tuple[Attitude, Attitude] | None = None
+    """Under Pix4D's names: as Pix4D defines the angles, and as gimbals measure them, which some drones write there."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 
@@ -272,7 +291,11 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     if place is not None and not in_xmp:
         place, datum, datum_error_m = to_wgs84(place, gps)
     (altitude, altitude_type), both = read_altitudes(gps, xmp)
-    attitude, default = read_attitude(xmp)
+    attitudes, default = _read_attitudes(xmp)
+    if orientation != 1:
+        attitudes = None
+    if attitudes and plain_text(tags.get(0x0110)).upper() in _GIMBALS_UNDER_PIX4D:
+        attitudes = attitudes[1], attitudes[1]
     return ImageMetadata(
         name=name,
         path=path,
@@ -291,8 +314,9 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         gps_error_m=_gps_error(gps),
         datum_error_m=datum_error_m,
         fix="" if in_xmp else read_fix(gps),
-        relative_altitude=first_number(xmp, "RelativeAltitude", "sensefly:Height") or None,
-        attitude=attitude if orientation == 1 else None,
+        relative_altitude=first_number(xmp, *_OVER_TAKE_OFF) or None,
+        attitude=attitudes[looks_backwards(attitudes)] if attitudes else None,
+        attitudes=attitudes if attitudes and attitudes[0] is not attitudes[1] else None,
         file_bytes=size,
         has_alpha_channel=found.has_alpha_channel,
         doubts=tuple(filter(None, (unclear, datum, default, *((lens.doubt, lens.remark) if lens else ())))),
@@ -374,10 +398,11 @@ def _subsecond(details: Mapping[int, Any]) -> float | None:
 
 
 def _stated_std(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
-    """What the receiver says: DJI's RTK, or Pix4D's names, which makers of wings and of multispectral cameras write.
-    Centimetres of a receiver that had no corrections are those of an earlier moment."""
-    across, upwards = "Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"
-    names = (("RtkStdLon", across), ("RtkStdLat", across), ("RtkStdHgt", upwards))
+    """What the receiver says: DJI's RTK, Pix4D's names, which makers of wings and of multispectral cameras write,
+    senseFly's older ones, Skydio's. Centimetres of a receiver without corrections are those of an earlier moment."""
+    across = "Camera:GPSXYAccuracy", "sensefly:GPSXYAccuracy", "GpsHorizontalAccuracy"
+    upwards = "Camera:GPSZAccuracy", "sensefly:GPSZAccuracy", "GpsVerticalAccuracy"
+    names = (("RtkStdLon", *across), ("RtkStdLat", *across), ("RtkStdHgt", *upwards))
     found = [first_number(xmp, *each) for each in names]
     least = UNCORRECTED_M if first_number(xmp, "RtkFlag") in NOT_CORRECTED else 0.0
     east, north, up = (value if value is not None and least < value < 100 else None for value in found)

@@ -23,6 +23,8 @@ SMALL_FILE_RATIO = 0.4
 MIN_OVERLAP = 0.6
 #: A place should be seen by so many photographs (choice).
 MIN_VIEWS_PER_POINT = 4.0
+#: Positions whose stated error across is smaller (metres) were corrected, as they were taken or afterwards (choice).
+RTK_M = 0.2
 #: Views farther from straight down than this are oblique (degrees).
 OBLIQUE_ANGLE_DEG = 20.0
 
@@ -43,8 +45,10 @@ class PreflightReport:
     spread_m: tuple[float, float] | None
     """East and north."""
     altitude_reference: str
-    rtk: int
+    accurate: int
     """How many say how accurate they are."""
+    rtk: bool
+    """Whether all these are as accurate as with corrections."""
     height_m: float | None
     height_from: str
     gsd_m: float | None
@@ -67,6 +71,7 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     days = sorted(
         {f"{when:%Y-%m-%d}" for when in (time_of(photo.datetime) for photo in photographs) if when is not None}
     )
+    accuracies = [max(photo.gps_std[:2]) for photo in photographs if photo.gps_std is not None]
     overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return PreflightReport(
@@ -78,7 +83,8 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
         positions=len(positions),
         spread_m=None if spread is None else (float(spread[0]), float(spread[1])),
         altitude_reference=positions.altitude_reference,
-        rtk=sum(photo.gps_std is not None for photo in photographs),
+        accurate=len(accuracies),
+        rtk=bool(accuracies) and max(accuracies) < RTK_M,
         height_m=height, height_from=height_from,
         gsd_m=height / focal if height and focal else None,
         forward_overlap=overlap, views_per_point=views,

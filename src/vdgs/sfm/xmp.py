@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from itertools import islice
 
 from vdgs.captures.xmp_packets import as_utf8
 
@@ -18,9 +19,14 @@ _ATTRIBUTE = re.compile(
     rf"({_NAME}):({_NAME})[ \t\r\n]{{0,16}}=[ \t\r\n]{{0,16}}(?:\"([^\"<]{{0,400}})\"|'([^'<]{{0,400}})')"
 )
 _ELEMENT = re.compile(rf"<({_NAME}):({_NAME})(?:[ \t\r\n][^<>]{{0,200}})?>([^<]{{0,400}})</")
-#: The one structure whose fields have names that others have too (Skydio): how the camera lies, north, east, down.
-_CAMERA = re.compile(r"CameraOrientationNED\b")
-_CAMERA_BYTES = 600
+#: Structures whose fields have names that others have too (Skydio): how the camera lies, north, east, down; its lens.
+_STRUCTURE = re.compile(rf"<{_NAME}:(CameraOrientationNED|CalibratedFocalLength|CalibratedOpticalCenter)\b")
+_STRUCTURE_BYTES, _MOST_STRUCTURES = 600, 8
+#: Structures about something else than the photograph and its camera: what is shown, other files, regions, edits.
+_ELSEWHERE = re.compile(
+    rf"<({_NAME}:(?:LocationShown|LocationCreated|EventLocation|ArtworkOrObject|ImageRegion|Regions|RegionInfo|Pantry"
+    r"|Ingredients|DerivedFrom|ManagedFrom|History|Look|MaskGroupBasedCorrections))\b"
+)
 #: The band of a multispectral camera, as a list; color photographs list three.
 _BAND = re.compile(
     r"<(Camera:BandName)>\s{0,200}<rdf:(?:Seq|Bag)>((?:\s{0,200}<rdf:li>[^<]{0,100}</rdf:li>){1,8})\s{0,200}</rdf:(?:Seq|Bag)>"
@@ -30,7 +36,7 @@ _ITEM = re.compile(r"<rdf:li>([^<]{0,100})<")
 
 def read_xmp(packet: bytes) -> dict[str, str]:
     """Attributes and elements without children by `prefix:Name`, prefixes as they are in the file; {} for nonsense."""
-    text = as_utf8(packet).decode("utf-8", errors="replace")
+    text = _of_photograph(as_utf8(packet).decode("utf-8", errors="replace"))
     found: dict[str, str] = {}
     for prefix, name, value in _values(text):
         if prefix != "xmlns" and len(found) < MAX_VALUES:
@@ -38,12 +44,30 @@ def read_xmp(packet: bytes) -> dict[str, str]:
     band = _BAND.search(text)
     if band and len(names := _ITEM.findall(band[2])) == 1:
         found.setdefault(band[1], names[0].strip())
-    camera = _CAMERA.search(text)
-    if camera:
-        body = text[camera.end() : camera.end() + _CAMERA_BYTES].partition("CameraOrientationNED")[0]
-        for _, name, value in _values(body):
-            found.setdefault(f"CameraOrientationNED:{name}", value)
+    for structure in islice(_STRUCTURE.finditer(text), _MOST_STRUCTURES):
+        body = text[structure.end() : structure.end() + _STRUCTURE_BYTES].partition(structure[1])[0]
+        head = body.partition(">")[0]
+        for _, name, value in _values(head if head.endswith("/") else body):
+            found.setdefault(f"{structure[1]}:{name}", value)
     return found
+
+
+def _of_photograph(text: str) -> str:
+    """The packet without structures about something else, whose fields have the same names; one that does not end ends
+    the packet."""
+    kept, at = [], 0
+    while start := _ELSEWHERE.search(text, at):
+        kept.append(text[at : start.start()])
+        opened = text.find(">", start.end())
+        end = f"</{start[1]}>"
+        closed = text.find(end, opened) if opened > 0 else -1
+        if text[opened - 1 : opened] == "/":
+            at = opened + 1
+        elif closed < 0:
+            at = len(text)
+        else:
+            at = closed + len(end)
+    return "".join([*kept, text[at:]])
 
 
 def _values(text: str) -> Iterator[tuple[str, str, str]]:
