@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri, fdtri, stdtrit
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
-from vdgs.geometry.similarity import Similarity
+from vdgs.geometry.similarity import Similarity, rotation_about
 
 #: From so many on, east and north have a standard deviation each; of fewer they share one.
 ENOUGH_FOR_AXES = 20
@@ -35,8 +34,9 @@ UNUSED_TIMES = 1e5
 MOST_ALIKE = 0.95
 #: Positions wander where residuals differ by so many times more between photographs farther apart; of so many (choice).
 CHANCE, ENOUGH_TO_WANDER = 1.3, 15
-#: Rounds in which standard deviations and outliers settle, and steps of Gauss and Newton in each.
-ROUNDS, STEPS = 6, 6
+#: Rounds in which standard deviations and outliers settle, and steps of Gauss and Newton in each: no more of them where
+#: one changes nothing by so much (radians, metres, share of scale).
+ROUNDS, STEPS, CONVERGED = 6, 6, 1e-9
 #: A fit is worse than nothing where scale (share), scale by what wanders alone, or north (degrees) may be farther off
 #: (95 %; choice).
 WORST_SCALE, WORST_WANDERING, WORST_NORTH_DEG = 0.6, 0.3, 45.0
@@ -244,45 +244,43 @@ def _step(
     each of these changes with each residual [8, m, 3]."""
     sigma = gps_std * np.array([1.0, 1.0, UNUSED_TIMES if model == "unused" else 1.0])
     away, spread = problem.centers[inliers] - middle, np.deg2rad(problem.up.deviation_deg)
+    count = len(away)
+    # A row for each residual, then what is known of up, of the drift, and perhaps of scale; each weighed.
+    rows = np.zeros((3 * count + (3 if problem.scale is None else 4), 8))
+    values = np.zeros(len(rows))
+    weighed, level = rows[: 3 * count].reshape(count, 3, 8), rows[3 * count : 3 * count + 2]
+    weighed[:, (0, 1, 2), (4, 5, 6)] = 1 / sigma
+    if model == "drifts":
+        weighed[:, 2, 7] = times[inliers] / sigma[2]
+    rows[3 * count + 2, 7] = 1e-3  # a drift is anything up to a kilometre
+    if problem.scale is not None:
+        rows[-1, 0] = 1 / problem.scale[1]
     for _ in range(STEPS):
         turned = state.scale * away @ state.rotation.T
-        jacobian = np.zeros((len(away), 3, 8))
-        jacobian[:, :, 0] = turned
-        jacobian[:, 0, 2], jacobian[:, 0, 3] = turned[:, 2], -turned[:, 1]
-        jacobian[:, 1, 1], jacobian[:, 1, 3] = -turned[:, 2], turned[:, 0]
-        jacobian[:, 2, 1], jacobian[:, 2, 2] = turned[:, 1], -turned[:, 0]
-        jacobian[:, :, 4:7] = np.eye(3)
-        jacobian[:, 2, 7] = times[inliers] if model == "drifts" else 0.0
-        weighed = (jacobian / sigma[:, None]).reshape(-1, 8)
-        off = (_residuals(problem, state, middle, times)[inliers] / sigma).ravel()
-        rows, values = [weighed], [off]
+        weighed[:, :, 0] = turned / sigma
+        weighed[:, 0, 2], weighed[:, 0, 3] = turned[:, 2] / sigma[0], -turned[:, 1] / sigma[0]
+        weighed[:, 1, 1], weighed[:, 1, 3] = -turned[:, 2] / sigma[1], turned[:, 0] / sigma[1]
+        weighed[:, 2, 1], weighed[:, 2, 2] = turned[:, 1] / sigma[2], -turned[:, 0] / sigma[2]
+        values[: 3 * count] = (_residuals(problem, state, middle, times)[inliers] / sigma).ravel()
         up = state.rotation @ problem.up.direction
-        level = np.zeros((2, 8))
-        level[0, 2], level[0, 3], level[1, 1], level[1, 3] = up[2], -up[1], -up[2], up[0]
-        rows.append(level / spread)
-        values.append(tilt_of(up) / spread)
+        level[0, 2], level[0, 3], level[1, 1], level[1, 3] = np.array([up[2], -up[1], -up[2], up[0]]) / spread
+        values[3 * count : 3 * count + 2] = tilt_of(up) / spread
+        values[3 * count + 2] = 1e-3 * state.drift
         if problem.scale is not None:
-            known = np.zeros((1, 8))
-            known[0, 0] = 1.0
-            rows.append(known / problem.scale[1])
-            values.append(np.array([math.log(state.scale / problem.scale[0]) / problem.scale[1]]))
-        drift = np.zeros((1, 8))
-        drift[0, 7] = 1e-3  # a drift is anything up to a kilometre
-        rows.append(drift)
-        values.append(np.array([1e-3 * state.drift]))
-        stacked = np.concatenate(rows)
-        normal = stacked.T @ stacked
-        change = -np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0]
+            values[-1] = math.log(state.scale / problem.scale[0]) / problem.scale[1]
+        normal = rows.T @ rows
+        change = -np.linalg.lstsq(rows, values, rcond=None)[0]
         change[:4] *= min(1.0, 0.5 / max(float(np.abs(change[:4]).max()), 1e-300))
-        turn = Rotation.from_rotvec(change[1:4]).as_matrix()
         state = _State(
             state.scale * math.exp(change[0]),
-            turn @ state.rotation,
+            rotation_about(change[1:4]) @ state.rotation,
             state.middle + change[4:7],
             state.drift + change[7],
         )
+        if np.abs(change).max() < CONVERGED:
+            break
     covariance = np.linalg.pinv(normal, hermitian=True)
-    gains = covariance @ (jacobian / sigma[:, None] ** 2).reshape(-1, 8).T
+    gains = covariance @ (weighed / sigma[:, None]).reshape(-1, 8).T
     return state, normal, gains.reshape(8, -1, 3)
 
 
