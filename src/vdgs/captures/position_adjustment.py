@@ -36,7 +36,7 @@ MOST_ALIKE = 0.95
 CHANCE, ENOUGH_TO_WANDER = 1.3, 15
 #: Rounds in which standard deviations and outliers settle, and steps of Gauss and Newton in each: no more of them where
 #: one changes nothing by so much (radians, metres, share of scale).
-ROUNDS, STEPS, CONVERGED = 6, 6, 1e-9
+ROUNDS, STEPS, CONVERGED = 6, 6, 1e-6
 #: A fit is worse than nothing where scale (share), scale by what wanders alone, or north (degrees) may be farther off
 #: (95 %; choice).
 WORST_SCALE, WORST_WANDERING, WORST_NORTH_DEG = 0.6, 0.3, 45.0
