@@ -137,7 +137,7 @@ def test_exported_files_are_whole_or_absent(disk, native_small):
         ("view", "RUN", "--static", "DISK/site"),
         ("render", "RUN", "--output", "DISK/views"),
         ("render", "RUN", "--mode", "depth", "--raw", "--output", "DISK/numbers"),
-        ("render", "RUN", "--views", "flyover", "--output", "DISK/film.mp4"),
+        ("render", "RUN", "--views", "flyover", "--seconds", "4", "--output", "DISK/film.mp4"),
         ("inspect", "CAPTURE", "--output", "DISK/looks"),
         (
             *("synth", "--size", "toy", "--extent-m", "40", "--num-points", "200"),

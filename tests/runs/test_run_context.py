@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
 
 SETTINGS = (
     "--preset", "laptop", "--iterations", "12", "--model.num-offsets", "2", "--densify.start", "50", "--no-ortho",
-    "--blocks", "2", "--assignment.min-cameras", "4", "--block.iterations", "6", "--quiet",
+    "--blocks", "2", "--assignment.min-cameras", "3", "--block.iterations", "6", "--quiet",
 )  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def command(*arguments: object) -> None:
 @pytest.mark.parametrize("smaller", [False, True])
 def test_one_run_reads_its_capture_once_and_each_block_once(tmp_path, reads, monkeypatch, smaller):
     """Also where the run takes a smaller size of the photographs than the capture has."""
-    write_colmap(tmp_path / "capture", tiny_scene())
+    write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
     monkeypatch.setattr(time_estimate, "MAX_TIMED_SECONDS", 0.0)
     if smaller:
         monkeypatch.setattr(image_size, "MIN_SIDE", 1)

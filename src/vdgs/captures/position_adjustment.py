@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri, fdtri, stdtrit
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
 from vdgs.captures.position_weights import agreed, as_many, typical
-from vdgs.geometry.similarity import Similarity
+from vdgs.geometry.similarity import Similarity, rotation_about
 
 #: From so many on, east and north have a standard deviation each; of fewer they share one.
 ENOUGH_FOR_AXES = 20
@@ -38,6 +37,8 @@ MOST_ALIKE = 0.95
 CHANCE, ENOUGH_TO_WANDER = 1.3, 15
 #: Rounds in which standard deviations and outliers settle, and steps of Gauss and Newton in each.
 ROUNDS, STEPS = 6, 6
+#: A step that changes nothing by more ends its round (radians, metres, the logarithm of the scale).
+CONVERGED = 1e-6
 #: A fit is worse than nothing where scale (share), scale by what wanders alone, or north (degrees) may be farther off
 #: (95 %; choice).
 WORST_SCALE, WORST_WANDERING, WORST_NORTH_DEG = 0.6, 0.3, 45.0
@@ -297,13 +298,14 @@ def _step(
         normal = stacked.T @ stacked
         change = -np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0]
         change[:4] *= min(1.0, 0.5 / max(float(np.abs(change[:4]).max()), 1e-300))
-        turn = Rotation.from_rotvec(change[1:4]).as_matrix()
         state = _State(
             state.scale * math.exp(change[0]),
-            turn @ state.rotation,
+            rotation_about(change[1:4]) @ state.rotation,
             state.middle + change[4:7],
             state.drift + change[7],
         )
+        if np.abs(change).max() < CONVERGED:
+            break
     covariance = np.linalg.pinv(normal, hermitian=True)
     gains = (covariance @ (jacobian / sigma[:, :, None] ** 2).reshape(-1, 8).T).reshape(8, -1, 3)
     return state, normal, gains, np.einsum("kma,mak->ma", gains, jacobian)

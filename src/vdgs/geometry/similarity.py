@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -20,6 +19,8 @@ FEW_POINTS, SIGNIFICANT, OUTLIER_SIGMAS = 30, 0.0005, 7.0
 WORSE_AXIS = 0.005
 #: A similarity of space has so many parameters.
 PARAMETERS = 7
+#: Fits to triples are compared by so many residuals at once: some tens of megabytes.
+MOST_RESIDUALS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,20 +44,32 @@ def is_collinear(points: np.ndarray) -> bool:
     """Whether the points [n, 3] fix no rotation: fewer than three, or all near one line."""
     if len(points) < 3:
         return True
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= MAX_COLLINEAR_RATIO * spread[0])
+    return bool(_are_collinear(points))
+
+
+def _are_collinear(points: np.ndarray) -> np.ndarray:
+    """Of many sets of three points or more [..., n, 3]: [...] bool."""
+    spread = np.linalg.svd(points - points.mean(axis=-2, keepdims=True), compute_uv=False)
+    return np.asarray(spread[..., 1] <= MAX_COLLINEAR_RATIO * spread[..., 0])
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity of matched points [n, 3] (Umeyama 1991, eqs. 40-43)."""
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    centered_source, centered_target = source - source_mean, target - target_mean
-    left, singular, right = np.linalg.svd(centered_target.T @ centered_source)
-    sign = np.ones(3)
-    sign[2] = np.sign(np.linalg.det(left) * np.linalg.det(right)) or 1.0
-    rotation = (left * sign) @ right
-    scale = float((singular * sign).sum() / (centered_source**2).sum())
-    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+    scale, rotation, translation = _fits(source, target)
+    return Similarity(float(scale), rotation, translation)
+
+
+def _fits(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Those of many sets of points [..., n, 3] at once: scales [...], rotations [..., 3, 3], translations [..., 3]."""
+    source_mean, target_mean = source.mean(axis=-2), target.mean(axis=-2)
+    centered_source, centered_target = source - source_mean[..., None, :], target - target_mean[..., None, :]
+    left, singular, right = np.linalg.svd(centered_target.swapaxes(-1, -2) @ centered_source)
+    signs = np.ones_like(singular)
+    signs[..., 2] = np.where(np.linalg.det(left) * np.linalg.det(right) < 0, -1.0, 1.0)
+    rotation = (left * signs[..., None, :]) @ right
+    scale = np.asarray((singular * signs).sum(axis=-1) / (centered_source**2).sum(axis=(-2, -1)))
+    turned = (rotation @ source_mean[..., None])[..., 0]
+    return scale, rotation, target_mean - scale[..., None] * turned
 
 
 def fit_similarity_robust(
@@ -70,13 +83,16 @@ def fit_similarity_robust(
     """
     best = fit_similarity(source, target)
     best_median = np.median(_residuals(best, source, target))
-    for triple in _triples(len(source), num_iterations):
-        if is_collinear(source[triple]):
-            continue
-        candidate = fit_similarity(source[triple], target[triple])
-        median = np.median(_residuals(candidate, source, target))
-        if median < best_median:
-            best, best_median = candidate, median
+    triples = _triples(len(source), num_iterations)
+    triples = triples[~_are_collinear(source[triples])]
+    at_once = max(1, MOST_RESIDUALS // len(source))
+    for few in (triples[k : k + at_once] for k in range(0, len(triples), at_once)):
+        scales, rotations, translations = _fits(source[few], target[few])
+        placed = scales[:, None, None] * (source @ rotations.swapaxes(1, 2)) + translations[:, None]
+        medians = np.median(np.linalg.norm(placed - target, axis=2), axis=1)
+        k = int(medians.argmin())
+        if medians[k] < best_median:
+            best, best_median = Similarity(float(scales[k]), rotations[k], translations[k]), medians[k]
     # The floor keeps exact data (residuals 0) from losing points to rounding.
     floor = 1e-9 * (1 + np.abs(target).max())
     if len(source) <= FEW_POINTS:
@@ -92,14 +108,12 @@ def fit_similarity_robust(
     return best, inliers
 
 
-def _triples(count: int, most: int) -> Iterator[np.ndarray]:
-    """All triples of so many points where they are not more than `most`, else so many draws."""
+def _triples(count: int, most: int) -> np.ndarray:
+    """All triples of so many points where they are not more than `most`, else so many draws: [m, 3] int."""
     if comb(count, 3) <= most:
-        yield from map(np.array, combinations(range(count), 3))
-        return
+        return np.array(list(combinations(range(count), 3)), int).reshape(-1, 3)
     generator = np.random.default_rng(0)
-    for _ in range(most):
-        yield generator.choice(count, size=3, replace=False)
+    return np.array([generator.choice(count, size=3, replace=False) for _ in range(most)])
 
 
 @dataclass(frozen=True)
