@@ -76,6 +76,15 @@ def test_the_wrong_sign_of_the_roll_is_found_and_the_right_one_stays(noise_deg, 
         assert judged(true, angles * [1, 1, -1], noise_deg, rng) == BODY_NEGATED
 
 
+def test_the_sign_is_found_of_a_flight_that_the_wind_rolls_to_one_side():
+    """By a turn of the world most attitudes fit by either sign."""
+    rng = np.random.default_rng(6)
+    angles = np.column_stack([rng.normal(90, 2, 40), rng.normal(5, 1, 40), np.where(np.arange(40) % 4, 10.0, -10.0)])
+    true = stacked([attitude_from_aircraft(*each) for each in angles])
+    assert judged(true, angles, 0.5, rng) == BODY
+    assert judged(true, angles * [1, 1, -1], 0.5, rng) == BODY_NEGATED
+
+
 def test_the_angles_of_a_gimbal_are_found_by_cameras_that_turn():
     rng = np.random.default_rng(1)
     angles = np.column_stack([rng.uniform(0, 360, 30), rng.uniform(-30, 0, 30), rng.normal(0, 1, 30)])

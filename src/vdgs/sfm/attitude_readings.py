@@ -15,8 +15,9 @@ from vdgs.system.units import two_digits
 #: Another reading is plainly better that leaves so small a share of the residual, and so many degrees less; fewer
 #: photographs tell none (choice).
 SHARE_LEFT, GAIN_DEG, MIN_PHOTOGRAPHS = 0.5, 3.0, 10
-#: Rounds of the least sum of angles, and the angle (radians) from which on one counts.
-ROUNDS, LEAST_ANGLE = 20, 1e-4
+#: Rounds of the least sum of angles, the angle (radians) from which on one counts, and the degrees that the farthest
+#: count as: those of a minority that is wrong (choice).
+ROUNDS, LEAST_ANGLE, FARTHEST_DEG = 20, 1e-4, 20.0
 
 
 def confirmed_by_model(
@@ -43,7 +44,7 @@ def confirmed_by_model(
             changed |= {photo.name: replace(photo, attitude=photo.attitudes[holds]) for photo in group}
             notes.append(
                 f"the recorded angles of {camera} are read as {holds}: the photographs differ from these by "
-                f"{two_digits(off[holds])}° (median), from {now} by {two_digits(off[now])}°."
+                f"{two_digits(off[holds])}° on average, from {now} by {two_digits(off[now])}°."
             )
     return tuple(changed.get(photo.name, photo) for photo in photographs), tuple(notes)
 
@@ -51,20 +52,23 @@ def confirmed_by_model(
 def reading_that_holds(
     rotations: np.ndarray, recorded: Mapping[str, np.ndarray], now: str
 ) -> tuple[str, dict[str, float]]:
-    """The present reading, or another that is plainly better; and the residual of each, the median angle in degrees
-    that is left by one turn of the world from recorded attitudes to camera_from_world, all [n, 3, 3]."""
+    """The present reading, or another that is plainly better; and the residual of each, the mean angle in degrees that
+    is left by one turn of the world from recorded attitudes to camera_from_world, all [n, 3, 3].
+
+    Not the median: where the wind rolls a wing to one side mostly, a turn explains these photographs by either sign.
+    """
     off = {
-        name: _median_residual_deg(Rotation.from_matrix(attitudes.transpose(0, 2, 1) @ rotations))
+        name: _mean_residual_deg(Rotation.from_matrix(attitudes.transpose(0, 2, 1) @ rotations))
         for name, attitudes in recorded.items()
     }
     best = min(off, key=lambda name: off[name])
     return best if off[best] < min(SHARE_LEFT * off[now], off[now] - GAIN_DEG) else now, off
 
 
-def _median_residual_deg(turns: Rotation) -> float:
+def _mean_residual_deg(turns: Rotation) -> float:
     """Of turns about the one of the least sum of angles."""
     weights = np.ones(len(turns))
     for _ in range(ROUNDS):
         away = (turns.mean(weights).inv() * turns).magnitude()
         weights = 1 / np.maximum(away, LEAST_ANGLE)
-    return float(np.degrees(np.median(away)))
+    return float(np.minimum(np.degrees(away), FARTHEST_DEG).mean())
