@@ -20,6 +20,8 @@ from vdgs.sfm.gcp_list import GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_list import ImageList
+from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.scale_bars import ScaleBars, known_scale
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -50,10 +52,10 @@ def georeferenced(
     bars: ScaleBars | None,
     gcps: GcpList | None = None,
 ) -> Georeferenced:
-    prepared = SimpleNamespace(
-        gcps=gcps, scale_bars=bars, image_list=SimpleNamespace(images=photographs), gps_priors=positions, threads=1,
-        request=SimpleNamespace(options=SfmOptions(), gps=None), origin=positions.origin,
-        preflight=SimpleNamespace(height_m=None),
+    prepared = ReconstructionPlan(
+        request=SimpleNamespace(options=SfmOptions(), gps=None),
+        image_list=ImageList((), tuple(photographs), (), 0), gps_priors=positions,
+        preflight=SimpleNamespace(height_m=None), threads=1, pairs=0, gcps=gcps, scale_bars=bars,
     )  # fmt: skip
     return georeference(model, prepared, True)
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vdgs.sfm.image_metadata import attitude_from_gimbal
+from vdgs.sfm.image_metadata import Attitude, attitude_from_gimbal
 from vdgs.system.lazy_pycolmap import pycolmap
 
 WIDTH, HEIGHT, FOCAL = 1600, 1200, 1300.0
 
 
 def flown_model(
-    places: np.ndarray, rng: np.random.Generator, bowl: float = 0.0
+    places: np.ndarray, rng: np.random.Generator, bowl: float = 0.0, attitudes: Sequence[Attitude] | None = None
 ) -> tuple[pycolmap.Reconstruction, list[SimpleNamespace]]:
     """A model of cameras at places [n, 3] over points about height 0, marks off by half a pixel, and photographs with
     the attitudes that a drone records; `true_rotation` is camera_from_enu. Away from the origin the model rises as a
-    bowl, by so much times the distance squared."""
+    bowl, by so much times the distance squared. `attitudes` are the cameras', by default eastwards to a degree."""
     model, ground = pycolmap.Reconstruction(), _ground(places, rng)
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2, 0.0], camera_id=1
@@ -27,7 +28,8 @@ def flown_model(
     seen: list[list[tuple[int, int]]] = [[] for _ in ground]
     photographs = []
     for number, place in enumerate(places, 1):
-        attitude = attitude_from_gimbal(90.0, -90.0 + rng.normal(0, 1), rng.normal(0, 1))
+        drawn = attitude_from_gimbal(90.0, -90.0 + rng.normal(0, 1), rng.normal(0, 1))
+        attitude = drawn if attitudes is None else attitudes[number - 1]
         rotation = attitude.camera_from_enu
         rays = (ground - place) @ rotation.T
         pixels = FOCAL * rays[:, :2] / rays[:, 2:] + [WIDTH / 2, HEIGHT / 2]
@@ -44,7 +46,7 @@ def flown_model(
         photographs.append(
             SimpleNamespace(
                 name=name, attitude=attitude, true_rotation=rotation, relative_altitude=None, datetime="",
-                subsecond=None, face="", altitude=None,
+                subsecond=None, face="", altitude=None, attitudes={},
             )
         )  # fmt: skip
     for point, track in zip(ground, seen, strict=True):

@@ -18,7 +18,7 @@ from vdgs.sfm.brackets import SAME_STOPS
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
-from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata, looks_backwards
+from vdgs.sfm.image_metadata import BODY, GIMBAL, UNKNOWN_CAMERA, ImageMetadata, looks_backwards
 from vdgs.sfm.rig_folders import may_be_sensor
 
 #: Focal lengths within this share of each other are one.
@@ -193,8 +193,10 @@ def _one_altitude(group: list[ImageMetadata]) -> list[ImageMetadata]:
 def _one_convention(group: list[ImageMetadata]) -> list[ImageMetadata]:
     """Attitudes under Pix4D's names all as Pix4D defines them, or all as gimbals measure them, as the photographs of
     the camera tell together: pitches above -30 degrees may be either."""
-    backwards = looks_backwards(*(photo.attitudes for photo in group if photo.attitudes))
-    return [replace(photo, attitude=photo.attitudes[backwards]) if photo.attitudes else photo for photo in group]
+    reading = GIMBAL if looks_backwards(*(photo.attitudes for photo in group)) else BODY
+    return [
+        replace(photo, attitude=photo.attitudes[reading]) if reading in photo.attitudes else photo for photo in group
+    ]
 
 
 def _without_defaults(group: list[ImageMetadata]) -> list[ImageMetadata]:

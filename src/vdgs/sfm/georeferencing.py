@@ -15,8 +15,10 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, rotation_to_z
 from vdgs.sfm import gcp_adjustment, georegistration
+from vdgs.sfm.attitude_readings import confirmed_by_model
 from vdgs.sfm.bending import bend_to_positions, tell_level
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
+from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
@@ -47,6 +49,10 @@ class Georeferenced:
     origin: tuple[float, float, float] | None
     """Latitude and longitude in degrees, altitude in metres; None where they are not known."""
     survey: tuple[GcpReport, ...]
+    photographs: tuple[ImageMetadata, ...]
+    """Those of the plan, with attitudes by the readings that the model confirms."""
+    notes: tuple[str, ...] = ()
+    """Which cameras' angles are read otherwise than before."""
 
 
 def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool) -> Georeferenced:
@@ -55,6 +61,8 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
     """
     drop_unseen_observations(model)
+    photographs, notes = confirmed_by_model(model, prepared.image_list.images)
+    prepared = replace(prepared, image_list=replace(prepared.image_list, images=photographs))
     control = prepared.gcps
     doubtful = frozenset[str]()
     placed: Georegistration | AlignmentFailure
@@ -66,7 +74,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
             georegistration.transform_model(model, placed.similarity)
             model, placed = _bent(model, placed, prepared, hold_focal)
     if isinstance(placed, AlignmentFailure):
-        return Georeferenced(model, placed, None, ())
+        return Georeferenced(model, placed, None, (), photographs, notes)
     survey: tuple[GcpReport, ...] = ()
     if control is not None and placed.is_georeferenced:
         survey = gcp_adjustment.measure_gcps(
@@ -78,7 +86,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     latitude, longitude, altitude = prepared.origin
     altitude = altitude + ground if _knows_altitude(prepared, placed) else 0.0
     origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
-    return Georeferenced(model, placed, origin, survey)
+    return Georeferenced(model, placed, origin, survey, photographs, notes)
 
 
 def _knows_altitude(prepared: ReconstructionPlan, placed: Georegistration) -> bool:

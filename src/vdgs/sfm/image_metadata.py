@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +81,26 @@ NEARLY_DOWN_DEG = 20.0
 _BACKWARDS_DEG = -30.0
 #: Drones that write the gimbal's own angles under Pix4D's names, by EXIF's model: Autel's EVO Lite 640T.
 _GIMBALS_UNDER_PIX4D = ("XL715",)
+#: What three angles may be: those of a body that looks down when level, or of the gimbal, with their roll either way.
+BODY, BODY_NEGATED = "those of a body that looks down when level", "those of such a body with the roll negated"
+GIMBAL, GIMBAL_NEGATED = "those of the gimbal", "those of the gimbal with the roll negated"
+_READINGS = {
+    BODY: (attitude_from_aircraft, 1),
+    GIMBAL: (attitude_from_gimbal, 1),
+    BODY_NEGATED: (attitude_from_aircraft, -1),
+    GIMBAL_NEGATED: (attitude_from_gimbal, -1),
+}
+#: XMP's names of yaw, pitch and roll, and how those who write them may mean them.
+_WAYS: tuple[tuple[Any, ...], ...] = (
+    (("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"), GIMBAL),
+    (("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"), GIMBAL),
+    (("CameraOrientationNED:Yaw", "CameraOrientationNED:Pitch", "CameraOrientationNED:Roll"), GIMBAL),
+    (("drone-yuneec:GimbalYaw", "drone-yuneec:GimbalPitch", "drone-yuneec:GimbalRoll"), GIMBAL),
+    (("xmp:CameraYaw", "xmp:CameraPitch", "xmp:CameraRoll"), GIMBAL),  # Yuneec's CGO3+
+    (("sensefly:Heading", "sensefly:PitchAngle", "sensefly:RollAngle"), BODY, BODY_NEGATED),
+    (("sensefly:Yaw", "sensefly:Pitch", "sensefly:Roll"), BODY, BODY_NEGATED),
+    (("Camera:Yaw", "Camera:Pitch", "Camera:Roll"), BODY, GIMBAL, BODY_NEGATED, GIMBAL_NEGATED),
+)
 
 
 def read_attitude(xmp: Mapping[str, str]) -> tuple[Attitude | None, str]:
@@ -90,48 +110,43 @@ def read_attitude(xmp: Mapping[str, str]) -> tuple[Attitude | None, str]:
     Pix4D's names, and the aircraft that the camera is fixed to (senseFly). Angles that are all exactly 0 are those of a
     program that knew none.
     """
-    both, said = _read_attitudes(xmp)
-    return (both[looks_backwards(both)] if both else None), said
+    readings, said = _read_attitudes(xmp)
+    return _by_pitch(readings), said
 
 
-def looks_backwards(*both: tuple[Attitude, Attitude]) -> bool:
-    """Whether the second of each pair holds, where the first is what Pix4D defines and the second is what gimbals
-    measure: as many cameras would look backwards by the first as would look up by the second."""
-    pitches = [as_gimbal.tilt_deg - 90 for _, as_gimbal in both]
+def looks_backwards(*photographs: Mapping[str, Attitude]) -> bool:
+    """Whether angles are the gimbal's where their names define those of a body (`ImageMetadata.attitudes`): as many
+    cameras would look backwards as bodies as would look up by the gimbal."""
+    pitches = [each[GIMBAL].tilt_deg - 90 for each in photographs if BODY in each and GIMBAL in each]
     backwards = sum(pitch < _BACKWARDS_DEG for pitch in pitches)
     return 0 < backwards >= sum(pitch > 0 for pitch in pitches)
 
 
-def _read_attitudes(xmp: Mapping[str, str]) -> tuple[tuple[Attitude, Attitude] | None, str]:
-    """Where the camera looked, as the names define the angles and as some drones write them under these names; one
-    and the same mostly."""
-    for names, *ways in _WAYS:
+def _by_pitch(readings: Mapping[str, Attitude]) -> Attitude | None:
+    """The reading that the pitch of one photograph speaks for: the first, as the names define it, mostly."""
+    return readings[GIMBAL] if looks_backwards(readings) else next(iter(readings.values()), None)
+
+
+def _read_attitudes(xmp: Mapping[str, str]) -> tuple[dict[str, Attitude], str]:
+    """Where the camera looked by all readings that the names leave open, the defined one first; one mostly."""
+    for names, *readings in _WAYS:
         yaw, pitch, roll = (first_number(xmp, name) for name in names)
         if pitch is None:
             continue
         if not yaw and not pitch and not roll:
-            return None, DEFAULT_ANGLES
+            return {}, DEFAULT_ANGLES
         if max(abs(yaw or 0.0), abs(pitch), abs(roll or 0.0)) > 360:
             continue
         if yaw is None:
             yaw = first_number(xmp, "FlightYawDegree", "DroneYawDegree", "GPSImgDirection")
-        read = [from_angles(yaw or 0.0, pitch, roll or 0.0) for from_angles in ways]
-        both = read[0], read[-1]
-        known = yaw is not None or both[looks_backwards(both)].tilt_deg < NEARLY_DOWN_DEG
-        return (both if known else None), ""
-    return None, ""
-
-
-_WAYS: tuple[tuple[Any, ...], ...] = (
-    (("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"), attitude_from_gimbal),
-    (("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"), attitude_from_gimbal),
-    (("CameraOrientationNED:Yaw", "CameraOrientationNED:Pitch", "CameraOrientationNED:Roll"), attitude_from_gimbal),
-    (("drone-yuneec:GimbalYaw", "drone-yuneec:GimbalPitch", "drone-yuneec:GimbalRoll"), attitude_from_gimbal),
-    (("xmp:CameraYaw", "xmp:CameraPitch", "xmp:CameraRoll"), attitude_from_gimbal),  # Yuneec's CGO3+
-    (("sensefly:Heading", "sensefly:PitchAngle", "sensefly:RollAngle"), attitude_from_aircraft),
-    (("sensefly:Yaw", "sensefly:Pitch", "sensefly:Roll"), attitude_from_aircraft),
-    (("Camera:Yaw", "Camera:Pitch", "Camera:Roll"), attitude_from_aircraft, attitude_from_gimbal),
-)
+        found = {}
+        for reading in readings:
+            from_angles, sign = _READINGS[reading]
+            found[reading] = from_angles(yaw or 0.0, pitch, sign * (roll or 0.0))
+        attitude = _by_pitch(found)
+        known = attitude is not None and (yaw is not None or attitude.tilt_deg < NEARLY_DOWN_DEG)
+        return (found if known else {}), ""
+    return {}, ""
 
 
 #: A shorter side below this shows too little to be matched: a thumbnail.
@@ -219,8 +234,8 @@ class ImageMetadata:
     """What EXIF says against its position or altitude: `VOID`, `FLAT`; empty for nothing."""
     subsecond: float | None = None
     """The part of the second of `datetime`, where EXIF says it (SubSecTimeOriginal)."""
-    attitudes: tuple[Attitude, Attitude] | None = None
-    """Under Pix4D's names: as Pix4D defines the angles, and as gimbals measure them, which some drones write there."""
+    attitudes: Mapping[str, Attitude] = field(default_factory=dict, hash=False)
+    """By all readings of the recorded angles (`BODY`, ...), where their names leave several open."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
 
@@ -293,9 +308,9 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     (altitude, altitude_type), both = read_altitudes(gps, xmp)
     attitudes, default = _read_attitudes(xmp)
     if orientation != 1:
-        attitudes = None
-    if attitudes and plain_text(tags.get(0x0110)).upper() in _GIMBALS_UNDER_PIX4D:
-        attitudes = attitudes[1], attitudes[1]
+        attitudes = {}
+    if GIMBAL in attitudes and plain_text(tags.get(0x0110)).upper() in _GIMBALS_UNDER_PIX4D:
+        attitudes = {GIMBAL: attitudes[GIMBAL]}
     return ImageMetadata(
         name=name,
         path=path,
@@ -315,8 +330,8 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         datum_error_m=datum_error_m,
         fix="" if in_xmp else read_fix(gps),
         relative_altitude=first_number(xmp, *_OVER_TAKE_OFF) or None,
-        attitude=attitudes[looks_backwards(attitudes)] if attitudes else None,
-        attitudes=attitudes if attitudes and attitudes[0] is not attitudes[1] else None,
+        attitude=_by_pitch(attitudes),
+        attitudes=attitudes if len(attitudes) > 1 else {},
         file_bytes=size,
         has_alpha_channel=found.has_alpha_channel,
         doubts=tuple(filter(None, (unclear, datum, default, *((lens.doubt, lens.remark) if lens else ())))),

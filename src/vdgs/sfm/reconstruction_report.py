@@ -68,8 +68,8 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
     cameras = cameras_of(model, result.camera_groups)
-    turned = tilt_from_attitudes(model, collection.images) if metric else None
-    warnings = [*look.warnings, *_warnings(cameras, held, height, look.height_m, turned, tilt)]
+    turned = tilt_from_attitudes(model, result.found.photographs) if metric else None
+    warnings = [*look.warnings, *result.found.notes, *_warnings(cameras, held, height, look.height_m, turned, tilt)]
     if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions with altitudes
         up = placed.residuals[:, 2]
         names = [collection.images[int(positions.image_indices[row])].name for row in placed.position_rows]
