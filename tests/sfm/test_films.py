@@ -111,7 +111,7 @@ def taken(flight: Path) -> tuple[ImageList, str]:
          (51.4503, -2.5927), 132.86, 1.3, 24.0),
         ("GPS (-2,5927, 51,4503, 15), D 1,41m, H 12,10m", (51.4503, -2.5927), None, 12.1, None),
         ("GPS(E: 8,2, N: 47,1, 412,5m)", (47.1, 8.2), 412.5, None, None),
-        ("[latitude: 5.145e1] [longitude: -2.5e-05] [rel_alt: 1.3 abs_alt: 1,328.5]", (51.45, -2.5e-5), None, 1.3, None),
+        ("[latitude: 5.1e1] [longitude: -2.5e-05] [rel_alt: 1.3 abs_alt: 1,32.5]", (51, -2.5e-5), None, 1.3, None),
         ("GPS (-2.5927, 51.4503, 15), D 141.0ft, H 110.0ft, H.S 0.0mph", (51.4503, -2.5927), None, 33.528, None),
         ("[latitude: 51.45] [longitude: -2.5] [rel_alt: 100 ft abs_alt: 1000feet]", (51.45, -2.5), 304.8, 30.48, None),
     ],
