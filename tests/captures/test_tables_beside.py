@@ -67,6 +67,22 @@ def test_the_table_of_odm_is_left_out_where_asked_and_where_it_cannot_be_read(tm
     assert said.startswith(f"positions beside the photographs are not used: {tmp_path / 'b/geo.txt'}: names neither")
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("card/track.gpx", '<?xml version="1.0"?>\n<gpx><trkpt lat="1" lon="2"/></gpx>'),
+        ("flight.kml", "<?xml version='1.0'?><kml><coordinates>-70.6,-33.5,500</coordinates></kml>"),
+        ("track.tcx", "<?xml version='1.0'?><TrainingCenterDatabase/>"),
+        ("log.csv", "time,lat,lon,alt\n2024-06-01 08:00:00,47.1,8.2,400\n2024-06-01 08:00:01,47.1,8.2,400\n"),
+    ],
+)
+@pytest.mark.parametrize("placed", [False, True])
+def test_a_track_beside_photographs_without_positions_is_named_with_the_remedy(tmp_path, name, text, placed):
+    _, said = planned(tmp_path, name, text, placed)
+    assert len(said) == (0 if placed else 1)
+    assert all(f"{tmp_path / name}: " in each and "`exiftool -geotag TRACK PHOTOGRAPHS`" in each for each in said)
+
+
 def test_control_points_and_other_texts_beside_photographs(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()

@@ -103,20 +103,39 @@ def taken(flight: Path) -> tuple[ImageList, str]:
         ("RTK (120.08, 30.2, 18), HOME (120.0, 30.0, 103.55m), H 1.03m", (30.2, 120.08), None, 1.03, None),
         ("GPS(W: 117.04, N: 32.96, 32.15m)", (32.96, -117.04), 32.15, None, None),
         ("GPS (30.2, 120.08, 18)", (30.2, 120.08), None, None, None),
+        ("2023.08.07 20:10:01\nGPS(-41.3899,174.0177,0.0M) BAROMETER:97.7M", (-41.3899, 174.0177), None, 97.7, None),
+        ("2022.06.21 16:06:17\nGPS(36.6146,-6.1120,0.0M) BAROMETER:0.3M", (36.6146, -6.112), None, 0.3, None),
+        ("GPS(174.0177,-41.3899,0.0M) BAROMETER:97.7M", (-41.3899, 174.0177), None, 97.7, None),
+        ("GPS(8.2,47.1,412.0m)", (47.1, 8.2), 412.0, None, None),
+        ("[latitude: 51,4503] [longitude: -2,5927] [rel_alt: 1,300 abs_alt: 132,860] [focal_len: 24,00]",
+         (51.4503, -2.5927), 132.86, 1.3, 24.0),
+        ("GPS (-2,5927, 51,4503, 15), D 1,41m, H 12,10m", (51.4503, -2.5927), None, 12.1, None),
+        ("GPS(E: 8,2, N: 47,1, 412,5m)", (47.1, 8.2), 412.5, None, None),
+        ("[latitude: 5.1e1] [longitude: -2.5e-05] [rel_alt: 1.3 abs_alt: 1,32.5]", (51, -2.5e-5), None, 1.3, None),
+        ("GPS (-2.5927, 51.4503, 15), D 141.0ft, H 110.0ft, H.S 0.0mph", (51.4503, -2.5927), None, 33.528, None),
+        ("[latitude: 51.45] [longitude: -2.5] [rel_alt: 100 ft abs_alt: 1000feet]", (51.45, -2.5), 304.8, 30.48, None),
     ],
 )  # fmt: skip
 def test_dialects_of_subtitles(words, place, altitude, relative, focal):
     [record] = read_telemetry([(1.0, words)])
     assert record.lat_lon == pytest.approx(place)
-    assert record.altitude == altitude
-    assert record.relative_altitude == relative
+    assert record.altitude == (altitude and pytest.approx(altitude))
+    assert record.relative_altitude == (relative and pytest.approx(relative))
     assert record.focal_35mm == (focal and pytest.approx(focal))
+
+
+@pytest.mark.parametrize("angles", ["-90.0°, 0.5°, 12.1°", "-90.0,0.5,12.1", "-90,0°, 0,5°, 12,1°"])
+def test_angles_of_gimbals_have_points_or_commas(angles):
+    assert read_telemetry([(0.0, f"G.PRY ({angles})")])[0].gimbal == (12.1, -90.0, 0.5)
 
 
 def test_where_the_film_began_tells_the_order_of_two_numbers():
     blocks = [(float(k), f"GPS (47.1{k}, 8.2, 12)") for k in range(3)]
     assert read_telemetry(blocks, (47.1, 8.2))[0].lat_lon == (47.10, 8.2)
     assert read_telemetry(blocks)[0].lat_lon == (8.2, 47.10)  # as DJI documents it
+    in_m = [(0.0, "GPS(47.1,8.2,0.0M) BAROMETER:1.0M")]
+    assert read_telemetry(in_m, (8.2, 47.1))[0].lat_lon == (8.2, 47.1)
+    assert read_telemetry(in_m)[0].lat_lon == (47.1, 8.2)  # as the Matrice 300 writes it
 
 
 def test_no_fix_and_no_place_are_no_position():

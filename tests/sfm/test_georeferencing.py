@@ -17,11 +17,13 @@ from vdgs.captures.position_adjustment import PositionFit, Problem, Up, radius_9
 from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
+from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm import georegistration
+from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.flights import untrusted_offsets
-from vdgs.sfm.georeferencing import FOOT_M, Doubts
+from vdgs.sfm.georeferencing import FOOT_M, Doubts, _refuse_upside_down
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
@@ -486,6 +488,14 @@ def test_attitudes_that_plainly_contradict_the_views_are_not_used():
     assert up.how == "the views"
 
 
+def placed_image(number: int, place: np.ndarray, pose: np.ndarray) -> SimpleNamespace:
+    """A photograph of a model: its place [3] and camera_from_world [3, 3]."""
+    return SimpleNamespace(
+        name=str(number), has_pose=True, points2D=(), projection_center=lambda: place,
+        cam_from_world=lambda: SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: pose)),
+    )  # fmt: skip
+
+
 def survey_looking_down(pitch_deg: float) -> tuple[SimpleNamespace, list[SimpleNamespace], GpsPriors]:
     """A survey of 25 photographs, nearly straight down, with this pitch of the gimbal recorded."""
     rng = np.random.default_rng(0)
@@ -493,14 +503,12 @@ def survey_looking_down(pitch_deg: float) -> tuple[SimpleNamespace, list[SimpleN
     places = np.array([[20.0 * (k % 5), 20.0 * (k // 5), 60 + rng.normal(0, 1)] for k in range(25)])
     for k, place in enumerate(places):
         pose = attitude_from_gimbal(90.0 * (k % 2), -85.0, 0.0).camera_from_enu @ turn.T
-        images[k] = SimpleNamespace(
-            name=str(k), has_pose=True, projection_center=lambda place=place: turn @ place,
-            cam_from_world=lambda pose=pose: SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: pose)),
-        )  # fmt: skip
+        images[k] = placed_image(k, turn @ place, pose)
         recorded = attitude_from_gimbal(90.0 * (k % 2), pitch_deg, 0.0)
         photographs.append(
-            SimpleNamespace(name=str(k), attitude=recorded, face="", datetime="", subsecond=None, gps_std=None)
-        )
+            SimpleNamespace(name=str(k), attitude=recorded, face="", datetime="", subsecond=None, gps_std=None,
+                            relative_altitude=None)
+        )  # fmt: skip
     points = {k: SimpleNamespace(xyz=turn @ each) for k, each in enumerate(rng.uniform(0, 80, (400, 3)) * [1, 1, 0.05])}
     positions = GpsPriors(
         enu=places - [40.0, 40, 60], gps_std=np.full((25, 3), 1.0), image_indices=np.arange(25),
@@ -519,6 +527,84 @@ def test_attitudes_that_look_up_are_named_where_positions_look_mirrored_by_them(
     with pytest.raises(CaptureError, match="mirrored") as said:
         georegistration.georegister(model, photographs, flipped)
     assert "attitudes" not in str(said.value)
+
+
+def flight_along_a_line(pitch_deg: float) -> tuple[SimpleNamespace, list[SimpleNamespace], GpsPriors]:
+    """18 photographs along one line to the east, by hand, of one heading and without attitudes."""
+    rng = np.random.default_rng(0)
+    turn, k = Rotation.random(random_state=3).as_matrix(), np.arange(18)
+    places = np.stack([6.0 * k - 51, 3 * np.sin(k), 70 + rng.normal(0, 0.3, 18)], axis=1)
+    pose = attitude_from_gimbal(90.0, pitch_deg, 0.0).camera_from_enu @ turn.T
+    images = {number: placed_image(number, turn @ place, pose) for number, place in enumerate(places)}
+    photographs = [
+        SimpleNamespace(name=str(each), attitude=None, face="", datetime="", subsecond=None, gps_std=None,
+                        relative_altitude=70.0)
+        for each in k
+    ]  # fmt: skip
+    ahead = 70 / np.tan(np.radians(-pitch_deg))
+    ground = rng.uniform([-90, -40, -1], [90, 40, 1], (400, 3)) + np.array([ahead, 0, 0])
+    positions = GpsPriors(
+        enu=places * [1, 1, 0], gps_std=np.full((18, 3), 1.0), image_indices=k, origin=(47.3, 8.5, 500.0),
+        altitude_reference="", source="EXIF", notes=(),
+    )  # fmt: skip
+    points = {number: SimpleNamespace(xyz=turn @ place) for number, place in enumerate(ground)}
+    return SimpleNamespace(images=images, points3D=points), photographs, positions
+
+
+@pytest.mark.parametrize("pitch_deg", [-90.0, -80.0])
+def test_exchanged_positions_along_a_line_are_refused_though_up_is_in_doubt(pitch_deg):
+    """Level at a wall or straight down is one for photographs of one heading: neither looks straight up."""
+    model, photographs, positions = flight_along_a_line(pitch_deg)
+    assert not georegistration.up_of(model, photographs)[0].sure
+    placed = georegistration.georegister(model, photographs, positions)
+    assert isinstance(placed, Georegistration)
+    assert abs(placed.similarity.scale - 1) < 0.05
+    exchanged = replace(positions, enu=positions.enu[:, [1, 0, 2]])
+    with pytest.raises(CaptureError, match=r"fit the photographs only once .* Are latitude and longitude exchanged"):
+        georegistration.georegister(model, photographs, exchanged)
+    anyway = georegistration.georegister(model, photographs, exchanged, anyway=True)
+    assert any("used all the same" in note for note in anyway.notes)
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "roll_deg", "turned_over"),
+    [
+        pytest.param(-90.0, 0.0, False, id="a survey"),
+        pytest.param(0.0, 0.0, False, id="a facade"),
+        pytest.param(45.0, 0.0, False, id="a look up at a facade"),
+        pytest.param(-10.0, 180.0, False, id="a camera that hangs upside down"),
+        pytest.param(90.0, 0.0, True, id="a survey upside down"),
+        pytest.param(45.0, 180.0, True, id="an oblique film upside down"),
+    ],
+)
+def test_views_of_a_world_upside_down_are_told_from_looks_up(pitch_deg, roll_deg, turned_over):
+    rotations = np.array([attitude_from_gimbal(yaw, pitch_deg, roll_deg).camera_from_enu for yaw in (0, 5, 90, 180)])
+    assert are_turned_over(rotations) == turned_over
+
+
+@pytest.mark.parametrize("over", [True, False])
+def test_a_world_placed_upside_down_is_refused_though_up_is_in_doubt(over):
+    """Whatever placed it, by nothing that a mirror image explains; but from under a ceiling photographs look about."""
+    model, photographs, _ = flight_along_a_line(-90.0)
+    turn = Rotation.random(random_state=3).as_matrix()
+    turn = (np.diag([1.0, -1, -1]) if over else np.eye(3)) @ turn.T
+    model.images = {
+        number: placed_image(number, turn @ image.projection_center(),
+                             image.cam_from_world().rotation.matrix() @ turn.T)
+        for number, image in model.images.items()
+    }  # fmt: skip
+    model.points3D = {number: SimpleNamespace(xyz=turn @ point.xyz) for number, point in model.points3D.items()}
+    prepared = SimpleNamespace(
+        request=SimpleNamespace(options=SfmOptions()), image_list=SimpleNamespace(images=photographs)
+    )
+    ground = float(np.median(georegistration.model_points(model)[:, 2]))
+    placed = SimpleNamespace(method="GPS")
+    if not over:
+        return _refuse_upside_down(model, ground, placed, prepared)
+    with pytest.raises(CaptureError, match="m under the ground and look up"):
+        _refuse_upside_down(model, ground, placed, prepared)
+    prepared.request.options = SfmOptions(georeference="anyway")
+    return _refuse_upside_down(model, ground, placed, prepared)
 
 
 # ---------------------------------------------------------------------------------------------- control points

@@ -332,6 +332,14 @@ def test_the_height_over_the_median_point_is_compared_where_views_show_the_groun
     assert bool(found) == said
 
 
+@pytest.mark.parametrize("recorded", [70.0, None])
+def test_views_that_look_up_from_under_the_median_point_are_always_named(recorded):
+    [found] = _warnings((), (True, ""), height=-250.0, recorded=recorded, turned=None, tilt=179.8)
+    assert "250.0 m under the median point and look up (180° from straight down)" in found
+    assert ("70.0 m over its take-off" in found) == (recorded is not None)
+    assert not _warnings((), (True, ""), height=-3.0, recorded=5.0, turned=None, tilt=95.0)  # a facade
+
+
 @pytest.mark.parametrize(
     ("lower", "others", "said"),
     [

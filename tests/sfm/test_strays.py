@@ -260,6 +260,29 @@ def test_a_photograph_that_lost_its_tags_is_used_as_the_others_of_its_size(tmp_p
     assert any(f"{names[2]}: no tags of a camera; taken as by Maker Drone" in each for each in said(found))
 
 
+@pytest.mark.parametrize(("lost", "lent"), [(COUNT // 2, True), (COUNT // 2 + 1, False)])
+def test_where_half_lost_their_tags_they_are_of_the_others_camera(tmp_path, lost, lent):
+    """And where more did, it is said that they may be."""
+    names = flight(tmp_path)
+    for k, name in enumerate(names[:lost]):
+        picture(tmp_path / name, pixels(k), quality=95)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert len({photo.camera for photo in found.images}) == (1 if lent else 2)
+    words = "taken as by Maker Drone" if lent else "but the size of those by Maker Drone.*exiftool -TagsFromFile"
+    assert any(re.search(f"no tags of a camera[;,] {words}", each) for each in said(found))
+
+
+def test_half_of_another_size_without_tags_are_photographs_and_masks_of_the_same_size_are_not(tmp_path):
+    names = flight(tmp_path / "a")
+    for k in range(COUNT):
+        picture(tmp_path / f"a/other{k}.jpg", pixels(k, 200), quality=95)
+        picture(tmp_path / f"b/mask{k}.jpg", np.repeat(half()[..., None], 3, 2), quality=95)
+    assert len(collect_images([tmp_path / "a"]).images) == 2 * COUNT
+    flight(tmp_path / "b")
+    assert [photo.name for photo in collect_images([tmp_path / "b"]).images] == names
+
+
 def test_photographs_without_any_tags_are_photographs(tmp_path):
     for k in range(COUNT):
         picture(tmp_path / f"{k}.png", pixels(k, 160 + 8 * (k % 2)))

@@ -51,14 +51,15 @@ from vdgs.captures.table_columns import (
 from vdgs.captures.text_tables import LOOKED_AT, Line, read_lines, rows_of
 from vdgs.errors import CaptureError
 
-_BY_TIME = (
+#: What errors say of a track, which has a position for each moment.
+BY_TIME = (
     "by time and not by photograph. Let `exiftool -geotag TRACK PHOTOGRAPHS`, or the receiver's own program, write the "
     "positions into the photographs."
 )
 #: How files begin that have positions but are no tables of them, and what to do.
 _OTHERS = (
-    (r"<gpx|<kml|<trainingcenter|^\$g[pnlab][a-z]{3},", f"is a track, {_BY_TIME}"),
-    (r"^% *(program|gpst|utc|jst)\b|^%.*latitude\(deg\)", f"is a solution of RTKLIB or Emlid, {_BY_TIME}"),
+    (r"<gpx|<kml|<trainingcenter|^\$g[pnlab][a-z]{3},", f"is a track, {BY_TIME}"),
+    (r"^% *(program|gpst|utc|jst)\b|^%.*latitude\(deg\)", f"is a solution of RTKLIB or Emlid, {BY_TIME}"),
     (r"<blocksexchange", "is BlocksExchange XML (DJI Terra, ContextCapture). Export the positions as text instead."),
     (r"<document\b", "is Metashape's XML. Export the reference as text instead (.txt, .csv), with a line of columns."),
     (r"\A<", "is XML. Export the positions as text instead, with the columns name,lat,lon,alt."),
@@ -220,7 +221,7 @@ def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns,
         return columns, rows[1:]
     if {"lat", "lon"} <= set(known):
         found = ", ".join(word for word in rows[0].words if word)
-        remedy = f"It is {_BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
+        remedy = f"It is {BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
         raise CaptureError(f"{file}: has positions but no column of photographs' names (found: {found}). {remedy}")
     if {"name", "x", "y"} <= set(known):
         if system is None and "system" in known and len(rows) > 1:

@@ -1,4 +1,4 @@
-"""Tables of positions and lists of control points that lie beside photographs, and that nobody has given."""
+"""Tables of positions, tracks and lists of control points that lie beside photographs, and that nobody has given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vdgs.captures.georeference import match_rows
-from vdgs.captures.gps_tables import read_gps_table
+from vdgs.captures.gps_tables import BY_TIME, read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 
@@ -17,6 +17,7 @@ ODM_POSITIONS, ODM_CONTROL_POINTS = "geo.txt", "gcp_list.txt"
 #: Positions of fewer photographs are not worth a word.
 _MIN_ROWS = 3
 _SUFFIXES = frozenset({".txt", ".csv", ".tsv", ".mrk"})
+_TRACK_SUFFIXES = frozenset({".gpx", ".kml", ".tcx", ".nmea", ".pos"}) | _SUFFIXES
 #: Larger files are no tables of photographs; a folder of more of them is one for other things (choice).
 _MAX_BYTES, _MAX_FILES = 5_000_000, 20
 
@@ -44,6 +45,18 @@ def position_tables(folders: Iterable[Path], names: Sequence[str]) -> list[Table
     )
 
 
+def track_notes(folders: Iterable[Path]) -> list[str]:
+    """How to use tracks in the folders, which have positions by time, for photographs that have none."""
+    found = []
+    for file in _candidates(folders, _TRACK_SUFFIXES):
+        try:
+            read_gps_table(file)
+        except CaptureError as error:
+            if str(error).endswith(BY_TIME):
+                found.append(f"positions beside the photographs, which say none, are not used: {error}")
+    return found
+
+
 def control_points_beside(folders: Iterable[Path]) -> Path | None:
     """ODM's list of control points in one of the folders."""
     return next((file for file in _candidates(folders) if file.name.lower() == ODM_CONTROL_POINTS), None)
@@ -59,11 +72,11 @@ def table_note(table: TableBeside, number: int) -> str:
     )
 
 
-def _candidates(folders: Iterable[Path]) -> list[Path]:
+def _candidates(folders: Iterable[Path], suffixes: frozenset[str] = _SUFFIXES) -> list[Path]:
     found: dict[Path, None] = {}
     for folder in dict.fromkeys(folders):
         with suppress(OSError):
-            files = [each for each in sorted(folder.iterdir()) if each.suffix.lower() in _SUFFIXES and each.is_file()]
+            files = [each for each in sorted(folder.iterdir()) if each.suffix.lower() in suffixes and each.is_file()]
             if len(files) <= _MAX_FILES:
                 found |= dict.fromkeys(each for each in files if each.stat().st_size <= _MAX_BYTES)
     return list(found)

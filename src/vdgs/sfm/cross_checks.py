@@ -216,30 +216,40 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     """Pictures among the photographs that are none of the flight, with the reason; and photographs whose tags were
     lost, with the camera of the others of their size.
 
-    A picture without any tags is a stray only where most others have them.
+    A picture without any tags is a stray only where most others have them, and has lost its tags where half do; where
+    fewer do, it is said what it may be.
     """
     reasons = _smaller_copies(photographs) | _other_cameras(photographs) | _later_copies(photographs)
     reasons |= _versions_elsewhere([photo for photo in photographs if photo.name not in reasons])
     tagged = [photo for photo in photographs if not is_bare(photo)]
     bare = [photo for photo in photographs if is_bare(photo) and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()
-    if len(bare) >= len(tagged):
-        return reasons, lent
     kinds = Counter((photo.size, photo.camera, photo.lens) for photo in tagged)
     for photo in bare:
         alike = [(camera, lens) for size, camera, lens in kinds if size == photo.size]
-        if not alike:
+        if len(bare) > len(tagged):
+            if len(alike) == 1 and alike[0][1] is not None:
+                lent[photo.name] = replace(photo, doubts=(*photo.doubts, _may_be_by(alike[0][0])))
+        elif not alike and len(bare) < len(tagged):
             reasons[photo.name] = (
                 f"has no tags of a camera, and {photo.width} x {photo.height} pixels, unlike the photographs: no "
                 "photograph of this flight? (Give it their tags if it is one.)"
             )
-        elif is_black_and_white(photo):
+        elif alike and is_black_and_white(photo):
             reasons[photo.name] = "is black and white and has no tags of a camera: a mask? Name it like its photograph"
         elif len(alike) == 1:
             camera, lens = alike[0]
             doubt = f"no tags of a camera; taken as by {camera}, as the others of its size"
             lent[photo.name] = replace(photo, camera=camera, lens=lens, doubts=(*photo.doubts, doubt))
     return reasons, lent
+
+
+def _may_be_by(camera: str) -> str:
+    """Of pictures without tags that are more than those with: what to do if one camera took all."""
+    return (
+        f"no tags of a camera, but the size of those by {camera}: if it took this one, give it the tags (exiftool "
+        "-TagsFromFile), which say the focal length that is a guess now"
+    )
 
 
 def is_bare(photo: ImageMetadata) -> bool:

@@ -16,6 +16,7 @@ from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, rotation_to_z
 from vdgs.sfm import gcp_adjustment, georegistration
 from vdgs.sfm.attitude_readings import confirmed_by_model
+from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.bending import bend_to_positions, tell_level
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -331,13 +332,16 @@ def _distance(meters: float) -> str:
 def _refuse_upside_down(
     model: pycolmap.Reconstruction, ground: float, placed: Georegistration, prepared: ReconstructionPlan
 ) -> None:
-    """Raise CaptureError for a placed world whose cameras look at the sky from under the ground, though none did."""
+    """Raise CaptureError for a placed world whose cameras look at the sky from under the ground, though none did: by
+    what is known of up, or, where that is in doubt, by how far up they look."""
     if prepared.request.options.georeference == "anyway":
         return
     images = [image for image in model.images.values() if image.has_pose]
     height = float(np.median([image.projection_center()[2] for image in images])) - ground
     up, _ = georegistration.up_of(model, prepared.image_list.images)
-    if up.sure and up.direction[2] < 0:
+    views = np.array([image.cam_from_world().rotation.matrix() for image in images])
+    is_doubted = not up.sure and height < 0 and are_turned_over(views)
+    if up.direction[2] < 0 and (up.sure or is_doubted):
         raise CaptureError(
             f"placed by {placed.method}, the cameras would be {abs(height):.3g} m "
             f"{'under' if height < 0 else 'over'} the "

@@ -17,7 +17,7 @@ from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity, geometric_median, is_collinear, rotation_to_z
-from vdgs.sfm.attitude_tilt import tilt_of_attitudes
+from vdgs.sfm.attitude_tilt import are_turned_over, tilt_of_attitudes
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -123,17 +123,18 @@ def georegister(
         relative=relative_deviations(deviations),
         has_altitudes=positions.has_altitudes,
     )
-    others = _other_readings(targets, positions.origin) if up.sure else {}
-    wrong = mirrored(centers, targets, up.direction, others)
+    far = _viewing_distance(list(images.values()), model)
+    levelled, offsets = _without_offsets(problem, positions, rows, far)
+    fit, barometer, over_ground = _best_fit(levelled, taken)
+    views, wrong = np.array([_rotation(image) for image in images.values()]) @ fit.similarity.rotation.T, ""
+    if up.sure or are_turned_over(views):
+        wrong = mirrored(centers, targets, up.direction, _other_readings(targets, positions.origin))
     if wrong and not anyway:
         raise CaptureError(
             f"the positions ({positions.source}) fit the photographs only once {wrong}: as they are, the world would "
             "be its own mirror image, or upside down. Are latitude and longitude exchanged, or is a hemisphere (S, W, "
             f"a minus sign) missing?{up.doubt} {ANYWAY}"
         )
-    far = _viewing_distance(list(images.values()), model)
-    levelled, offsets = _without_offsets(problem, positions, rows, far)
-    fit, barometer, over_ground = _best_fit(levelled, taken)
     if over_ground:
         positions = replace(positions, has_altitudes=False)
     elsewhere = _elsewhere(fit, far)

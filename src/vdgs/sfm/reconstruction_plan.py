@@ -17,7 +17,7 @@ from vdgs.captures.reconstruction import (
     WORK_FOLDER,
     is_reconstruction,
 )
-from vdgs.captures.tables_beside import ODM_POSITIONS, control_points_beside, position_tables, table_note
+from vdgs.captures.tables_beside import ODM_POSITIONS, control_points_beside, position_tables, table_note, track_notes
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
@@ -108,7 +108,8 @@ def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[Sfm
             f"{number} and is used. To leave it out: --georeference off"
         )
         return replace(request, gps=used.file), notes
-    return request, [*notes, *(table_note(table, number) for table in tables)]
+    notes += [table_note(table, number) for table in tables]
+    return request, notes if tables or placed >= MIN_POSITIONS else [*notes, *track_notes(folders)]
 
 
 def _check_marks(options: SfmOptions, collection: ImageList) -> None:

@@ -11,6 +11,7 @@ from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
 from vdgs.errors import CaptureError
+from vdgs.sfm.attitude_tilt import tilt_of_views
 from vdgs.sfm.camera_rigs import describe_rigs
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
@@ -65,8 +66,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     images = placed_images(model)
     metric = placed is not None
     height = _height(model, images) if metric else None
-    forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
-    tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
+    tilt = tilt_of_views(np.array([image.cam_from_world().rotation.matrix() for image in images])) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, result.found.photographs) if metric else None
     warnings = [*look.warnings, *result.found.notes, *_warnings(cameras, held, height, look.height_m, turned, tilt)]
@@ -218,6 +218,13 @@ def _warnings(
             found.append(
                 f"{camera.name}: the fitted focal length is {drift:+.0%} off what {camera.focal_source} says{remedy}"
             )
+    if height is not None and height < 0 and tilt is not None and tilt > 180 - LEVEL_TILT_DEG:
+        flown = f", the drone recorded {recorded:.1f} m over its take-off" if recorded else ""
+        found.append(
+            f"the cameras are {-height:.1f} m under the median point and look up ({tilt:.0f}° from straight down)"
+            f"{flown}: unless they did (under a roof or a bridge), the scene is upside down. Are latitude and "
+            "longitude exchanged, or is a hemisphere missing?"
+        )
     sees_ground = tilt is not None and tilt < LEVEL_TILT_DEG
     if sees_ground and height is not None and recorded and abs(height / recorded - 1) > MAX_HEIGHT_DRIFT:
         found.append(

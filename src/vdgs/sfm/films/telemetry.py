@@ -2,7 +2,8 @@
 
 Dialects differ by drone and firmware: `[latitude: 47.1] [longitude: 8.2] [rel_alt: 10.0 abs_alt: 400.0]` (also
 `longtitude`, blanks before the colon, all within <font>), `GPS(8.2,47.1,15) BAROMETER:10.2`, `GPS (8.2, 47.1, 15), D
-24.02m, H 10.20m, G.PRY (-90.0°, 0.0°, 12.1°)`, `GPS(E: 8.2, N: 47.1, 412.00m)`.
+24.02m, H 10.20m, G.PRY (-90.0°, 0.0°, 12.1°)`, `GPS(E: 8.2, N: 47.1, 412.00m)`; and with the latitude first
+`GPS(47.1,8.2,0.0M) BAROMETER:10.2M` (Matrice 300, XT2).
 """
 
 from __future__ import annotations
@@ -14,20 +15,24 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
 from vdgs.captures.angles import LIMITS, side_of
+from vdgs.captures.table_columns import FOOT_M
 
 #: Between records that are farther apart than this (seconds) nothing is known.
 MAX_GAP_S = 3.0
 #: Before the first record and after the last these count for so many seconds: as far as firmwares' records are apart.
 MAX_OUTSIDE_S = 1.0
-_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+#: A number of a list; one that stands alone, whose comma is that of decimals; and one with its unit.
+_NUMBER = r"([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"
+_ALONE = r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)(?![.,]?\d)"
+_LENGTH = rf"{_ALONE}\s*(m|ft|feet)?\b"
 _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _TAGS = re.compile(r"<[^>]{0,200}>")
 _MOMENT = re.compile(r"(\d{4})[-.:/](\d\d)[-.:/](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:[.,](\d{1,3}))?")
 _FIX = re.compile(r"\b(?:GPS|RTK)\s*\(([^)]{1,100})\)")
-_GIMBAL = re.compile(rf"G\.PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*,\s*{_NUMBER}")
-_HEIGHT = re.compile(rf"(?:\bBAROMETER\s*:?|\bH)\s*{_NUMBER}\s*m?\b", re.IGNORECASE)
+_GIMBAL = re.compile(r"G\.PRY\s*\(([^)]{1,100})")
+_HEIGHT = re.compile(rf"(?:\bBAROMETER\s*:?|\bH)\s*{_LENGTH}", re.IGNORECASE)
 _KEYED = {
-    name: re.compile(rf"(?<![\w.])(?:{words})\s*:\s*{_NUMBER}", re.IGNORECASE)
+    name: re.compile(rf"(?<![\w.])(?:{words})\s*:\s*{_ALONE}(?:\s*(ft|feet)\b)?", re.IGNORECASE)
     for name, words in {
         "latitude": "latitude|lat", "longitude": "longitude|longtitude|lon", "relative": "rel_alt",
         "absolute": "abs_alt|altitude", "focal": "focal_len", "zoom": "dzoom_ratio|dzoom",
@@ -55,6 +60,15 @@ class Telemetry:
     moment: datetime | None = None
 
 
+@dataclass(frozen=True)
+class _Pair:
+    """A latitude and a longitude in an order that is not said."""
+
+    numbers: tuple[float, float]
+    in_capital_m: bool
+    """Whether an altitude in M is the third, as drones write it that write the latitude first (Matrice 300, XT2)."""
+
+
 def read_subtitles(text: str) -> list[tuple[float, str]]:
     """The blocks of a file of subtitles (.SRT): when each begins, in seconds, and its words."""
     marks = list(_TIMES.finditer(text))
@@ -72,12 +86,12 @@ def read_telemetry(
     """What the blocks say, in order of time; empty where no block has anything of it. `place` (latitude, longitude) is
     what the film says of where it was begun: it decides the order of two numbers without names."""
     found = [_read(seconds, _TAGS.sub(" ", words)) for seconds, words in blocks]
-    unnamed = [pair for _, pair in found if pair is not None]
-    latitude_first = _latitude_first(unnamed, place)
+    latitude_first = _latitude_first([pair for _, pair in found if pair is not None], place)
     records = []
     for record, pair in found:
         if pair is not None:
-            record = replace(record, lat_lon=_place(*(pair if latitude_first else pair[::-1])))
+            numbers = pair.numbers if latitude_first else pair.numbers[::-1]
+            record = replace(record, lat_lon=_place(*numbers))
         if any(value is not None for name, value in vars(record).items() if name != "seconds"):
             records.append(record)
     return tuple(sorted(records, key=lambda record: record.seconds))
@@ -119,15 +133,14 @@ def _between(one: float | None, other: float | None, share: float) -> float | No
     return one if one is None or other is None else one + share * (other - one)
 
 
-def _read(seconds: float, words: str) -> tuple[Telemetry, tuple[float, float] | None]:
+def _read(seconds: float, words: str) -> tuple[Telemetry, _Pair | None]:
     """What a block says, and two numbers that are latitude and longitude in an order that is not said."""
-    values = {name: float(match[1]) for name, pattern in _KEYED.items() if (match := pattern.search(words))}
+    values = {name: _quantity(match) for name, pattern in _KEYED.items() if (match := pattern.search(words))}
     place = _place(values["latitude"], values["longitude"]) if {"latitude", "longitude"} <= values.keys() else None
     sided, unnamed, altitude = _fix(words) if place is None else (None, None, None)
     height = _HEIGHT.search(words)
-    relative = values.get("relative", float(height[1]) if height else None)
-    angles = _GIMBAL.search(words)
-    gimbal = (float(angles[3]), float(angles[1]), float(angles[2])) if angles else None
+    relative = values.get("relative", _quantity(height) if height else None)
+    gimbal = _gimbal(words)
     if {"yaw", "pitch", "roll"} <= values.keys():
         gimbal = values["yaw"], values["pitch"], values["roll"]
     record = Telemetry(
@@ -142,14 +155,38 @@ def _read(seconds: float, words: str) -> tuple[Telemetry, tuple[float, float] | 
     return record, unnamed
 
 
-def _fix(words: str) -> tuple[tuple[float, float] | None, tuple[float, float] | None, float | None]:
+def _quantity(match: re.Match[str]) -> float:
+    """A number and what follows it: as it is, in metres where it is in feet."""
+    return float(match[1].replace(",", ".")) * (FOOT_M if (match[2] or "").lower().startswith("f") else 1.0)
+
+
+def _parts(listed: str) -> list[str]:
+    """The parts of a list; without a period in it, more than three are numbers with decimal commas."""
+    parts = [part.strip() for part in listed.split(",")]
+    if "." in listed or len(parts) <= 3:
+        return parts
+    return [".".join(parts[k : k + 2]) for k in range(0, len(parts), 2)]
+
+
+def _gimbal(words: str) -> tuple[float, float, float] | None:
+    """Of `G.PRY (pitch, roll, yaw)`: yaw, pitch and roll in degrees."""
+    found = _GIMBAL.search(words)
+    angles = [re.fullmatch(rf"{_NUMBER}\s*°?", part) for part in _parts(found[1])] if found else []
+    if len(angles) != 3 or any(angle is None for angle in angles):
+        return None
+    pitch, roll, yaw = (float(angle[1]) for angle in angles if angle is not None)
+    return yaw, pitch, roll
+
+
+def _fix(words: str) -> tuple[tuple[float, float] | None, _Pair | None, float | None]:
     """Of `GPS(...)`: the place by sides (E: 8.2, N: 47.1), two numbers without, and the altitude where it has a unit:
-    without one the third number counts satellites."""
+    without one the third number counts satellites, and in M it is always 0."""
     found = _FIX.search(words)
     if found is None:
         return None, None, None
-    parts = [part.strip() for part in found[1].split(",")]
-    altitude = next((float(part[:-1]) for part in parts[2:] if re.fullmatch(rf"{_NUMBER}m", part)), None)
+    parts = _parts(found[1])
+    lengths = (re.fullmatch(rf"{_NUMBER}\s*(m|ft|feet)", part) for part in parts[2:])
+    altitude = next((_quantity(length) for length in lengths if length), None)
     sides, plain = dict[str, float](), list[float]()
     for part in parts[:2]:
         match = re.fullmatch(rf"(?:([NSEW])\s*:\s*)?{_NUMBER}", part, re.IGNORECASE)
@@ -161,18 +198,22 @@ def _fix(words: str) -> tuple[tuple[float, float] | None, tuple[float, float] | 
         plain.append(float(match[2]))
     if len(sides) == 2:
         return _place(sides["latitude"], sides["longitude"]), None, altitude
-    return None, (plain[0], plain[1]) if len(plain) == 2 and any(plain) else None, altitude
+    if len(plain) != 2 or not any(plain):
+        return None, None, altitude
+    in_capital_m = any(re.fullmatch(rf"{_NUMBER}\s*M", part) for part in parts[2:])
+    return None, _Pair((plain[0], plain[1]), in_capital_m), altitude
 
 
-def _latitude_first(pairs: Sequence[tuple[float, float]], place: tuple[float, float] | None) -> bool:
-    """DJI writes the longitude first; old firmware does not. Numbers beyond 90 decide, then where the film began."""
-    if any(abs(first) > LIMITS["latitude"] for first, _ in pairs):
+def _latitude_first(pairs: Sequence[_Pair], place: tuple[float, float] | None) -> bool:
+    """DJI writes the longitude first; old firmware and the Matrice 300 do not. Numbers beyond 90 decide, then where the
+    film began, then an altitude in M."""
+    if any(abs(pair.numbers[0]) > LIMITS["latitude"] for pair in pairs):
         return False
-    if any(abs(second) > LIMITS["latitude"] for _, second in pairs):
+    if any(abs(pair.numbers[1]) > LIMITS["latitude"] for pair in pairs):
         return True
     if place is None or not pairs:
-        return False
-    first, second = pairs[0]
+        return any(pair.in_capital_m for pair in pairs)
+    first, second = pairs[0].numbers
     return _away((first, second), place) < _away((second, first), place)
 
 
@@ -192,7 +233,7 @@ def _focal(words: str, values: dict[str, float]) -> float | None:
         return None
     zoom = zoom / _ZOOM_UNIT if zoom >= _ZOOM_UNIT / 10 else zoom
     written = _KEYED["focal"].search(words)
-    focal = focal if written is None or "." in written[1] else focal / _FOCAL_UNIT
+    focal = focal if written is None or re.search("[.,]", written[1]) else focal / _FOCAL_UNIT
     return focal * max(zoom, 1.0) if 5 <= focal <= 2000 else None
 
 
