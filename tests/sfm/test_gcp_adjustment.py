@@ -363,6 +363,21 @@ def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blank
 # ------------------------------------------------------------------------------------------------- placing
 
 
+def test_points_that_fit_to_a_part_of_a_pixel_are_no_outliers():
+    """One on a roof, off by a few centimetres, where the others agree to a millimetre and a pixel shows 11 cm."""
+    rng = np.random.default_rng(2)
+    surveyed = np.column_stack([rng.uniform(-40, 40, (8, 2)), rng.normal(0, 0.2, 8)])
+    surveyed[3, 2] = 12.6
+    seen = surveyed + rng.normal(0, 0.001, surveyed.shape)
+    seen[3, 2] += 0.04
+    assert not fit_to_gcps(seen / 5, surveyed)[1][3]
+    found, trusted = fit_to_gcps(seen / 5, surveyed, 0.11 / 5)
+    assert trusted.all()
+    assert found.scale == pytest.approx(5, rel=1e-3)
+    seen[3, 2] += 1
+    assert fit_to_gcps(seen / 5, surveyed, 0.11 / 5)[1].tolist() == [k != 3 for k in range(8)]
+
+
 @pytest.mark.parametrize(("count", "wrong"), [(5, 0), (6, 0), (7, 1), (9, 0)])
 def test_the_stated_accuracy_of_few_points_holds(count, wrong):
     rng = np.random.default_rng(count)
