@@ -261,11 +261,22 @@ def test_files_that_are_no_lists_are_refused(flight, tmp_path):
     with pytest.raises(CaptureError, match="not a text file"):
         read_gcp_list(flight.folder / flight.names[0], collection, ())
     for kind, text in (
-        ("is XML, as Metashape writes markers", '<?xml version="1.0"?>\n<document version="1.5.0">\n</document>\n'),
+        (
+            "is XML, as Metashape writes markers, or KML or LandXML points",
+            '<?xml version="1.0"?>\n<document version="1.5.0">\n</document>\n',
+        ),
         (
             "without their marks in photographs",
             "#Label,X,Y,Z\nP1,306231.5,4545350.1,233.6,0.005\nP2,306185.2,4545327.8,234,0.005\n",
         ),
+        ("without their marks in photographs", "1,5000.1,6000.2,100.3,CP\n2,5010.1,6010.2,100.3,CP\n"),
+        (
+            "without their marks in photographs",
+            "Name,Longitude,Latitude,Ellipsoidal height,CS name\nP1,11.5,48.1,520.3,WGS84\nP2,11.6,48.1,520,WGS84\n",
+        ),
+        (r"\(GSI\), of points without their marks in photographs", "*110001+00000000000000P1 81..00+00000000306231\n"),
+        ("marks without the coordinates of their points", "DJI_0001.JPG,gcp1,1234.5,567.8\n"),
+        ("JSON", '{"type": "FeatureCollection", "features": []}\n'),
     ):
         (tmp_path / "other.txt").write_text(text)
         with pytest.raises(CaptureError, match=rf"{kind}\. --gcp takes ODM's list: .* `x y z px py photograph name`"):
@@ -281,6 +292,31 @@ def test_files_that_are_no_lists_are_refused(flight, tmp_path):
         plan_reconstruction(
             SfmRequest(image_folders=(flight.folder,), output=tmp_path / "out", options=SfmOptions(check_points=("a",)))
         )
+
+
+def test_two_marks_of_a_point_in_a_photograph_are_refused(flight, tmp_path):
+    first = listed(flight).splitlines()[1].split()
+    for pixel, is_refused in (("100.2 80.1", False), ("140 80", True)):
+        again = " ".join([*first[:3], pixel, *first[5:]])
+        (tmp_path / "list.txt").write_text(f"{listed(flight)}\n{again}")
+        if is_refused:
+            with pytest.raises(CaptureError, match=r"line 8: the point a has another mark in .* in line 2\. Delete"):
+                read_gcp_list(tmp_path / "list.txt", collect_images([flight.folder]), ())
+        else:
+            read_gcp_list(tmp_path / "list.txt", collect_images([flight.folder]), ())
+
+
+def test_check_points_are_known_in_other_letters_where_that_leaves_one(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "list.txt"
+    file.write_text(listed(flight))
+    held_out = read_gcp_list(file, collection, ("A", "b", "C")).points
+    assert all(point.is_check_point for point in held_out)
+    assert all(point.is_check_point for point in read_gcp_list(file, collection, ("ALL",)).points)
+    file.write_text(listed(flight, {}, {}, {"name": "A"}, {"name": "A"}))
+    assert [point.is_check_point for point in read_gcp_list(file, collection, ("A", "a", "c")).points] == [True] * 3
+    file.write_text(listed(flight, *[{"name": "aX"}] * 2, *[{"name": "Ax"}] * 2))
+    with pytest.raises(CaptureError, match="--check-points ax: "):
+        read_gcp_list(file, collection, ("ax",))
 
 
 def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
@@ -325,6 +361,21 @@ def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blank
 
 
 # ------------------------------------------------------------------------------------------------- placing
+
+
+def test_points_that_fit_to_a_part_of_a_pixel_are_no_outliers():
+    """One on a roof, off by a few centimetres, where the others agree to a millimetre and a pixel shows 11 cm."""
+    rng = np.random.default_rng(2)
+    surveyed = np.column_stack([rng.uniform(-40, 40, (8, 2)), rng.normal(0, 0.2, 8)])
+    surveyed[3, 2] = 12.6
+    seen = surveyed + rng.normal(0, 0.001, surveyed.shape)
+    seen[3, 2] += 0.04
+    assert not fit_to_gcps(seen / 5, surveyed)[1][3]
+    found, trusted = fit_to_gcps(seen / 5, surveyed, 0.11 / 5)
+    assert trusted.all()
+    assert found.scale == pytest.approx(5, rel=1e-3)
+    seen[3, 2] += 1
+    assert fit_to_gcps(seen / 5, surveyed, 0.11 / 5)[1].tolist() == [k != 3 for k in range(8)]
 
 
 @pytest.mark.parametrize(("count", "wrong"), [(5, 0), (6, 0), (7, 1), (9, 0)])

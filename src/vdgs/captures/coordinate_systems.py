@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import FLATTENING, SEMI_MAJOR_M, geodetic_from_ecef
+from vdgs.geometry.datum_operation import DatumOperation, NoOperation, is_near_wgs84, operation_at
+from vdgs.geometry.geodesy import geodetic_from_ecef, median_place
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 _STARTS = re.compile(
@@ -43,6 +46,8 @@ _ALL_IN_FEET = "; x, y and heights in feet"
 WITHOUT_GEOID = "; heights as they are, for PROJ lacks the grid of their geoid"
 #: National datums of which nothing more is known differ from WGS 84 by up to so many metres.
 UNKNOWN_DATUM_M = 300.0
+#: By how many metres places may be off that a shift for a neighbouring country brought (choice).
+ELSEWHERE_M = 50.0
 #: A datum that moves places by less (degrees) is WGS 84 for PROJ.
 _SAME_DEG = 1e-8
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
@@ -105,17 +110,22 @@ def to_geodetic(
         import pyproj
     except ImportError:
         raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
+    crs = None
     try:
         crs = pyproj.CRS.from_user_input(_named(header))
         flat = len(crs.axis_info) == 2
         change = _to_latitude(crs, "EPSG:4326" if flat else "EPSG:4979", own_axes)
         up = _unit_without_heights(crs) if heights_as_xy else 1.0
     except pyproj.exceptions.ProjError:
+        if crs is not None and crs.geodetic_crs is not None:
+            fault = f"{where} names {crs.name}, which PROJ cannot compute. Give the coordinates in another system."
+            raise UnknownSystem(f"{file}: {fault}", header) from None
         raise UnknownSystem(
             f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
             f"and {header[:60]!r} names none.",
             header,
         ) from None
+    shifted = _Shifted(crs, own_axes, file)
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         x, y, z = places.T
@@ -130,7 +140,9 @@ def to_geodetic(
                 "once x and y change places. Write x (east) first, or under its name: easting, northing."
             )
         latitude, longitude, *heights = change(x, y) if flat else change(x, y, z)
-        return np.stack([latitude, longitude, *heights, *([z * up] if flat else [])], axis=1)  # whatever z is over
+        # Whatever z is over, where the system has no heights.
+        roughly = np.stack([latitude, longitude, *heights, *([z * up] if flat else [])], axis=1)
+        return shifted(places, roughly)
 
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
@@ -147,6 +159,51 @@ def to_geodetic(
     if flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or ""):
         name += _ALL_IN_FEET if heights_as_xy else HEIGHTS_IN_METERS
     return changed, name
+
+
+class _Shifted:
+    """Brings places of a system to WGS 84 by the one operation that maps in that system take too (`operation_at`): that
+    of the first places asked for, and kept. Systems that say their shift themselves stay as PROJ has them."""
+
+    def __init__(self, crs: Any, own_axes: bool, file: Path) -> None:
+        self._crs, self._own_axes, self._file = crs, own_axes, file
+        self._operation: DatumOperation | None = None
+        self._as_they_are = True
+
+    def __call__(self, places: Float[np.ndarray, "n 3"], roughly: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """`places` as the file has them, and `roughly` (within hundreds of metres) latitude, longitude and height."""
+        known = np.isfinite(roughly).all(axis=1)
+        if _says_its_shift(self._crs) or not known.any():
+            return roughly
+        if self._operation is None:
+            self._choose(roughly[known])
+            self._choose(self._changed(places[known], roughly[known]))  # now that the place is known to metres
+        return self._changed(places, roughly)
+
+    def _choose(self, geodetic: Float[np.ndarray, "n 3"]) -> None:
+        if np.isfinite(geodetic).all():
+            try:
+                self._operation, self._as_they_are = _operation_about(self._crs, geodetic, self._own_axes)
+            except NoOperation as error:
+                raise CaptureError(f"{self._file}: {error}. Give the coordinates in another system.") from None
+
+    def _changed(self, places: Float[np.ndarray, "n 3"], roughly: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        assert self._operation is not None
+        if not self._as_they_are:
+            return self._operation.to_geodetic(places)
+        return self._operation.to_geodetic(np.column_stack([places[:, :2], roughly[:, 2]]))
+
+
+def _operation_about(
+    crs: Any, geodetic: Float[np.ndarray, "n 3"], own_axes: bool = False
+) -> tuple[DatumOperation, bool]:
+    """The operation for places (latitude, longitude, height), and whether it leaves heights as they are: for systems
+    without heights, and for those whose geoid is not at hand."""
+    latitude, longitude, _ = median_place(geodetic)
+    found = operation_at(crs, latitude, longitude, own_axes)
+    if crs.is_compound and (found.is_ballpark or found.made_for):
+        return operation_at(_horizontal(crs), latitude, longitude, own_axes), True
+    return found, len(crs.axis_info) == 2
 
 
 def unit_without_heights(header: str) -> float:
@@ -204,7 +261,7 @@ def _to_latitude(crs: Any, target: str, own_axes: bool = False) -> Callable[...,
 
 
 @cache
-def _transformer(crs: Any, target: str, always_xy: bool) -> Any:
+def _transformer(crs: Any, target: Any, always_xy: bool) -> Any:
     """PROJ's way from a system to `target`, kept: it takes up to a second to be found."""
     import pyproj
 
@@ -243,18 +300,12 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
     crs = pyproj.CRS.from_user_input(_named(header))
     if _says_its_shift(crs) or crs.geodetic_crs is None or not len(geodetic):
         return 0.0, ""
-    datum, (latitude, longitude) = crs.geodetic_crs.to_2d(), np.median(geodetic[:, :2], axis=0).tolist()
+    datum = crs.geodetic_crs.to_2d()
     if datum.is_geocentric:
         datum = pyproj.crs.GeographicCRS(datum=datum.datum)
-    near: Any = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
-    with warnings.catch_warnings():  # of grids that are not at hand: another way is taken
-        warnings.simplefilter("ignore", UserWarning)
-        ways = pyproj.transformer.TransformerGroup(datum, "EPSG:4326", always_xy=True, area_of_interest=near)
-    way = ways.transformers[0] if ways.transformers else None
-    if way is None or way.accuracy < 0:
-        shape = datum.ellipsoid
-        off = (shape.semi_major_metre - SEMI_MAJOR_M, shape.inverse_flattening - 1 / FLATTENING) if shape else (9, 9)
-        if abs(off[0]) < 1 and abs(off[1]) < 0.01:
+    way, _ = _operation_about(crs, geodetic)
+    if way.is_ballpark or math.isinf(way.accuracy_m):
+        if is_near_wgs84(datum):
             return 0.0, ""
         if datum.name == "unknown":  # `to_geodetic` says so
             return UNKNOWN_DATUM_M, ""
@@ -262,10 +313,22 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
             f"taken as of WGS 84, for PROJ knows no shift from {datum.name} there (may be off by "
             f"{UNKNOWN_DATUM_M:.0f} m)"
         )
-    moved = np.abs(np.subtract(way.transform(longitude, latitude), (longitude, latitude))).max()
-    if moved < _SAME_DEG or way.accuracy == 0:
+    if way.made_for:
+        return ELSEWHERE_M, (
+            f"converted from {datum.name} to WGS 84 by a shift that is made for "
+            f"{shorten(way.made_for, 60, placeholder=' ...')} (may be off by {ELSEWHERE_M:.0f} m)"
+        )
+    place = np.array([median_place(geodetic)])
+    x, y, _ = way.from_geodetic(place)[0]
+    own = _transformer(_horizontal(crs), datum, True).transform(x, y) if not crs.is_geocentric else (math.inf,) * 2
+    moved = np.abs(np.subtract(own, place[0, 1::-1])).max()
+    if moved < _SAME_DEG or way.accuracy_m == 0:
         return 0.0, ""
-    return float(way.accuracy), f"converted from {datum.name} to WGS 84, good to {way.accuracy:.2g} m"
+    return way.accuracy_m, f"converted from {datum.name} to WGS 84, good to {way.accuracy_m:.2g} m"
+
+
+def _horizontal(crs: Any) -> Any:
+    return crs.sub_crs_list[0] if crs.is_compound else crs
 
 
 def look_like_degrees(places: np.ndarray) -> bool:
@@ -328,13 +391,18 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
         if (shift := _own_shift(crs)) is not None:
             return lambda places: geodetic_from_ecef(np.stack(shift.transform(*places.T), axis=1))
         datum = (crs.geodetic_crs or crs).datum
-        change = pyproj.Transformer.from_crs(GeocentricCRS(datum=datum), "EPSG:4979", always_xy=True)
+        earth = GeocentricCRS(datum=datum)
+        change = _transformer(earth, "EPSG:4979", True)
+        system = earth if crs.is_geocentric or crs.is_bound else _horizontal(crs)
+        to_system = _transformer(earth, system, True)
     except (pyproj.exceptions.ProjError, TypeError, AttributeError):
         raise UnknownSystem(f"{file}: the coordinate system {header[:60]!r} is not understood.", header) from None
+    shifted = _Shifted(system, False, file)
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         longitude, latitude, height = change.transform(*places.T)
-        return np.stack([latitude, longitude, height], axis=1)
+        roughly = np.stack([latitude, longitude, height], axis=1)
+        return np.column_stack([shifted(np.stack(to_system.transform(*places.T), axis=1), roughly)[:, :2], height])
 
     return changed
 
@@ -348,7 +416,7 @@ def false_origin(header: str) -> tuple[float, float]:
     import pyproj
 
     crs = pyproj.CRS.from_user_input(_named(header))
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    crs = _horizontal(crs)
     crs = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
     if not crs.is_projected or crs.coordinate_operation is None:
         return 0.0, 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from textwrap import shorten
 from typing import Any
@@ -11,11 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.errors import VdgsError
+from vdgs.geometry.datum_operation import DatumOperation, NoOperation, is_inside, is_near_wgs84, operation_at
 
 #: Where the altitudes of photographs come from is not known here; what they are taken for is.
 ELLIPSOIDAL_REFERENCE = "ellipsoidal (WGS 84), if the altitudes of the georeference are"
-#: Half the side of the area, in degrees, for which the best operation between two systems is chosen.
-_AREA_DEG = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,24 +30,15 @@ class CrsTransform:
     notes: tuple[str, ...]
     #: The factor from metres to the heights of the system: systems without heights get them in their own unit.
     _height_factor: float
-    _transformer: Any
+    _operation: DatumOperation
 
     def from_geodetic(self, geodetic: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """(latitude deg, longitude deg, ellipsoidal height m) to (easting, northing, height); inf out of reach."""
-        latitude, longitude, height = geodetic.T
-        x, y, z = self._transformer.transform(longitude, latitude, height)
-        return np.stack([x, y, np.asarray(z) * self._height_factor], axis=1)
+        return self._operation.from_geodetic(geodetic) * [1, 1, self._height_factor]
 
     def to_geodetic(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The inverse of `from_geodetic`."""
-        # Between datums of two dimensions PROJ inverts to a millimetre only; once more, what is missing is a nanometre.
-        missed = points - self.from_geodetic(self._inverted(points))
-        return self._inverted(points + missed)
-
-    def _inverted(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        x, y, z = points.T
-        longitude, latitude, height = self._transformer.transform(x, y, z / self._height_factor, direction="INVERSE")
-        return np.stack([latitude, longitude, height], axis=1)
+        return self._operation.to_geodetic(points / [1, 1, self._height_factor])
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
@@ -85,7 +74,7 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     meters = float(axes[0].unit_conversion_factor)
     if any(abs(axis.unit_conversion_factor - meters) > 1e-12 for axis in axes):
         raise VdgsError(f"--crs {code}: {crs.name} counts across and up in different units. Give one with one unit.")
-    transformer, notes = _operation(crs, code, origin)
+    operation, notes = _operation(crs, code, origin)
     own_heights = len(axes) == 3
     unit = "m" if meters == 1.0 else axes[0].unit_name
     heights = axes[2].name if own_heights else ELLIPSOIDAL_REFERENCE
@@ -93,7 +82,7 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     return CrsTransform(
         code=code, name=crs.name, unit=unit, meters_per_unit=meters, wkt=crs.to_wkt(),
         height_reference=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
-        _height_factor=1.0 if own_heights else 1 / meters, _transformer=transformer,
+        _height_factor=1.0 if own_heights else 1 / meters, _operation=operation,
     )  # fmt: skip
 
 
@@ -126,66 +115,37 @@ def _of_name(name: str) -> str | None:
     return next((f"EPSG:{each.code}" for each in known if each.name == name), None)
 
 
-def _operation(crs: Any, code: str, origin: tuple[float, float, float]) -> tuple[Any, tuple[str, ...]]:
-    """One operation for the whole scene (asked point by point, PROJ may change it in between), and notes about it."""
-    from pyproj.aoi import AreaOfInterest
-    from pyproj.transformer import TransformerGroup
-
+def _operation(crs: Any, code: str, origin: tuple[float, float, float]) -> tuple[DatumOperation, tuple[str, ...]]:
+    """The operation for the whole scene, and notes about it."""
     latitude, longitude, _ = origin
-    area: Any = AreaOfInterest(
-        longitude - _AREA_DEG, max(latitude - _AREA_DEG, -90), longitude + _AREA_DEG, min(latitude + _AREA_DEG, 90)
-    )
-    with warnings.catch_warnings():  # said below, in words
-        warnings.simplefilter("ignore", UserWarning)
-        group = TransformerGroup("EPSG:4979", crs, always_xy=True, area_of_interest=area)
-    needed = [grid for operation in group.unavailable_operations for grid in operation.grids]
-    grids = sorted({grid.short_name for grid in needed if not grid.available})
-    missing = f" It needs {' or '.join(grids[:3])}: `projsync --file NAME` fetches one." if grids else ""
-    if not group.transformers:
-        raise VdgsError(f"--crs {code}: PROJ knows no way from WGS 84 to {crs.name}.{missing} Give another system.")
-    found, elsewhere = group.transformers[0], False
-    if _is_ballpark(found) and (shift := _datum_shift(crs)) is not None:
-        found, elsewhere = shift, True
-    if len(crs.axis_info) == 3 and not crs.is_geocentric and _is_ballpark(found):
+    try:
+        found = operation_at(crs, latitude, longitude)
+    except NoOperation as error:
+        raise VdgsError(
+            f"--crs {code}: {error}. Give another system, such as {utm_epsg(latitude, longitude)}."
+        ) from None
+    grids = " or ".join(found.missing_grids[:3])
+    missing = f" It needs {grids}: `projsync --file NAME` fetches one." if grids else ""
+    if len(crs.axis_info) == 3 and not crs.is_geocentric and found.is_ballpark:
         vertical = crs.sub_crs_list[-1].name if crs.is_compound else crs.axis_info[2].name
+        flat = _horizontal(crs).to_epsg() or utm_epsg(latitude, longitude)[5:]
         raise VdgsError(
             f"--crs {code}: its heights ({vertical}) cannot be had from heights above the ellipsoid here.{missing} Or "
-            f"give the system without heights, {code.partition('+')[0]}."
+            f"give the system without heights, EPSG:{flat}."
         )
     notes = []
-    if elsewhere:
-        area = shorten(found.area_of_use.name if found.area_of_use else "elsewhere", 60, placeholder=" ...")
+    if found.made_for:
+        area = shorten(found.made_for, 60, placeholder=" ...")
         notes.append(
             f"{crs.name} is reached by a datum shift that is made for {area}; here coordinates may be off by tens of "
             f"metres.{missing}"
         )
-    elif _is_ballpark(found):
-        notes.append(
-            f"{crs.name} is reached without a datum shift: coordinates may be off by hundreds of metres.{missing}"
-        )
-    elif not group.best_available:
-        notes.append(f"{crs.name} is reached to about {found.accuracy:g} m, its best operation is missing.{missing}")
+    elif found.is_ballpark:
+        off = "a metre or two" if is_near_wgs84(crs) else "hundreds of metres"
+        notes.append(f"{crs.name} is reached without a datum shift: coordinates may be off by {off}.{missing}")
+    elif missing:
+        notes.append(f"{crs.name} is reached to about {found.accuracy_m:g} m, its best operation is missing.{missing}")
     use = crs.area_of_use
-    if use is not None and not _inside(latitude, longitude, use):
+    if use is not None and not is_inside(use, latitude, longitude):
         notes.append(f"{crs.name} is made for {use.name}; this place lies outside, and lengths are distorted.")
     return found, tuple(notes)
-
-
-def _is_ballpark(operation: Any) -> bool:
-    """Whether PROJ takes latitude and longitude for those of the other datum."""
-    return "ballpark" in operation.description.lower()
-
-
-def _datum_shift(crs: Any) -> Any | None:
-    """The best way from WGS 84 to a system wherever it is made for, with a datum shift; None where PROJ has none."""
-    from pyproj.transformer import TransformerGroup
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        ways = TransformerGroup("EPSG:4979", crs, always_xy=True).transformers
-    return next((way for way in ways if not _is_ballpark(way)), None)
-
-
-def _inside(latitude: float, longitude: float, use: Any) -> bool:
-    across = (longitude - use.west) % 360 <= (use.east - use.west) % 360 or abs(use.east - use.west) >= 360
-    return bool(across and use.south <= latitude <= use.north)

@@ -25,6 +25,9 @@ MIN_POINTS_FOR_OUTLIERS = 6
 FREE_HEIGHTS = 2
 #: A mark is right to about so many pixels: what is farther off counts less.
 MARK_SIGMA_PX = 2.0
+#: A point that fits the others to this share of what a pixel shows on the ground is no outlier, however well these fit
+#: each other: few agree by chance (choice).
+FITTING_PX = 0.5
 #: A mark so many pixels from where the model puts a surveyed point is wrong; points whose marks are farther off than
 #: this share of a photograph's longer side are not used (choice).
 MARK_WRONG_PX, MARK_USELESS = 8.0, 0.01
@@ -203,7 +206,7 @@ def adjust_to_gcps(
     rows = np.array([k for k, _ in used], int)
     _check_enough(targets[rows], len(wrong), gcps.source)
     places = np.array([seen.position for _, seen in used])
-    fit = fit_surveyed(places, targets[rows], level)
+    fit = fit_surveyed(places, targets[rows], level, _pixel_at(model, [seen for _, seen in used]))
     known, trusted, accuracy = fit.known, fit.trusted, fit.accuracy
     said = doubts(fit.similarity, places[trusted], fit.aims[trusted]) if doubts is not None else ""
     if said:
@@ -230,12 +233,15 @@ def adjust_to_gcps(
     return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
 
 
-def fit_surveyed(places: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], level: Level) -> SurveyedFit:
-    """The similarity from places that a model has to where they were surveyed (NaN: no height), and how good it is."""
+def fit_surveyed(
+    places: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], level: Level, pixel: float = 0.0
+) -> SurveyedFit:
+    """The similarity from places that a model has to where they were surveyed (NaN: no height), and how good it is;
+    `pixel` is what one shows there, in the model's unit."""
     known = np.isfinite(targets[:, 2])
     is_level = is_collinear(places[known])
     aims = _with_heights(places, targets, is_level, level)
-    similarity, trusted = fit_to_gcps(places, aims)
+    similarity, trusted = fit_to_gcps(places, aims, pixel)
     measured = 0 if is_level else int(known[trusted].sum())  # those of a levelled model are its own
     accuracy = gcp_accuracy(similarity.apply(places[trusted]), aims[trusted], measured)
     return SurveyedFit(known, is_level, aims, similarity, trusted, accuracy)
@@ -274,6 +280,18 @@ def _depth_beside_surface(
 def _useless_px(model: pycolmap.Reconstruction) -> float:
     longest = max(max(camera.width, camera.height) for camera in model.cameras.values())
     return max(MARK_WRONG_PX, MARK_USELESS * longest)
+
+
+def _pixel_at(model: pycolmap.Reconstruction, seen: Sequence[TriangulatedPoint]) -> float:
+    """What a pixel shows at points, the median in the model's unit; 0 without points."""
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    sizes = [
+        float(np.linalg.norm(each.position - images[mark.image].projection_center()))
+        / model.cameras[images[mark.image].camera_id].mean_focal_length()
+        for each in seen
+        for mark in each.agreeing
+    ]
+    return float(np.median(sizes)) if sizes else 0.0
 
 
 def _other_marks(model: pycolmap.Reconstruction, control: GcpList) -> str:
@@ -389,8 +407,14 @@ def _triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int,
     return {k: seen for k, seen in found if seen is not None}
 
 
-def fit_to_gcps(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:
-    """The similarity from points of a model to where they were surveyed, and which of them it counts, [n] bool."""
+def fit_to_gcps(
+    points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], pixel: float = 0.0
+) -> tuple[Similarity, np.ndarray]:
+    """The similarity from points of a model to where they were surveyed, and which of them it counts, [n] bool: those
+    too that fit to a part of a `pixel`, in the unit of the model."""
     if len(points) < MIN_POINTS_FOR_OUTLIERS:
         return fit_similarity(points, targets), np.ones(len(points), bool)
-    return fit_similarity_robust(points, targets)
+    similarity, trusted = fit_similarity_robust(points, targets)
+    off = np.linalg.norm(similarity.apply(points) - targets, axis=1)
+    fitting = trusted | (off <= FITTING_PX * pixel * similarity.scale)
+    return (similarity if (fitting == trusted).all() else fit_similarity(points[fitting], targets[fitting])), fitting

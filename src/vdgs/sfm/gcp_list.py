@@ -41,6 +41,10 @@ ALL_POINTS = "all"
 CHECK_PREFIX = "CHK-"
 #: Points higher above or below the sea are none (metres).
 _MAX_HEIGHT_M = 20_000.0
+#: How names of photographs end.
+_PHOTOGRAPH = re.compile(r"\.(jpe?g|tiff?|png|dng|heic|webp)$", re.I)
+#: Marks of one point in one photograph that are farther apart are of different things (pixels; choice).
+_ONE_MARK_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -134,10 +138,13 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     for line, sighting in found:
         groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
     names = [group[0][0].name or f"point {k}" for k, group in enumerate(groups.values(), 1)]
-    _check_held_out(check_points, names, file)
+    check_points = _held_out(check_points, names, file)
+    # Of all points at once first: the operation to WGS 84 is that of their middle.
+    transform(np.nan_to_num([group[0][0].place for group in groups.values()]))
     points = []
     for name, group in zip(names, groups.values(), strict=True):
         geodetic = _geodetic([line for line, _ in group], name, transform, system, file)
+        _check_one_mark(group, name, file)
         seen = tuple(sighting for _, sighting in group if sighting is not None)
         held_out = ALL_POINTS in check_points or name in check_points or name.startswith(CHECK_PREFIX)
         points.append(GroundControlPoint(name, geodetic, seen, held_out))
@@ -220,7 +227,7 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float, float, float | None]
     lines = [Line(*line) for line in text_lines(file, "control points")]
     if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
-    _check_is_list(lines[0].text, file)
+    _check_is_list([line.text for line in lines], file)
     text, count = join_definition([line.text for line in lines])
     header, lines = Line(lines[0].number, text), lines[count:]
     rows = [Row(line.number, line.text.split()) for line in lines]
@@ -233,19 +240,44 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float, float, float | None]
     return header.text, rows[1:], (meters_of(x), meters_of(y), told_meters(z))
 
 
-def _check_is_list(first: str, file: Path) -> None:
+def _check_is_list(lines: Sequence[str], file: Path) -> None:
     """Raise CaptureError for what programs export of control points without, or otherwise with, their marks."""
-    words = re.split(r"[\s,;]+", first)
-    kind = ""
-    if first.lstrip("\ufeff").startswith("<"):
-        kind = "XML, as Metashape writes markers"
-    elif not _is_number(words[0]) and len(words) > 3 and all(map(_is_number, words[1:4])):
-        kind = "a table of points without their marks in photographs"
+    kind = _other_format(lines[0].lstrip("\ufeff")) or _half_a_list(lines)
     if kind:
         raise CaptureError(
             f"{file}: is {kind}. --gcp takes ODM's list: a line that names the coordinate system (EPSG:32615), and for "
-            "each mark a line `x y z px py photograph name`."
+            "each mark a line `x y z px py photograph name`. Export it so, or put it together from both."
         )
+
+
+def _other_format(first: str) -> str:
+    """What a file is by its beginning, where that is no list of lines with words; empty for a list."""
+    if first.startswith("<"):
+        return "XML, as Metashape writes markers, or KML or LandXML points"
+    if first.startswith(("{", "[")):
+        return "JSON"
+    if re.match(r"\*?11\d{4}[+-]\w{8}", first):
+        return "a measurement file of Leica (GSI), of points without their marks in photographs"
+    return ""
+
+
+def _half_a_list(lines: Sequence[str]) -> str:
+    """What a table has, where it is of points without marks or of marks without points; empty for others."""
+    words, second = (re.split(r"[\s,;]+", line) for line in (lines[0], lines[min(1, len(lines) - 1)]))
+    if _PHOTOGRAPH.search(words[0]) and len(words) > 3 and all(map(_is_number, words[2:4])):
+        return "a table of marks without the coordinates of their points"
+    columns = known_columns(re.split(r"[,;\t]", lines[0]))
+    named = {"x", "y"} <= set(columns) or {"lat", "lon"} <= set(columns)
+    numbered = len(words) > 3 and all(map(_is_number, words[1:4]))
+    if (named or numbered) and not (_is_mark(words) or _is_mark(second)):
+        return "a table of points without their marks in photographs"
+    return ""
+
+
+def _is_mark(words: Sequence[str]) -> bool:
+    """Whether words name a photograph, or are five numbers and a name."""
+    row = len(words) > 5 and all(map(_is_number, words[:5])) and not _is_number(words[5])
+    return row or any(map(_PHOTOGRAPH.search, words))
 
 
 def _check_order(names: Row, file: Path) -> None:
@@ -326,10 +358,29 @@ def find_sighting(
     return GcpObservation(photo.name, photo.to_upright_pixel(pixel))
 
 
-def _check_held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> None:
-    unknown = [name for name in held_out if name not in names and name != ALL_POINTS]
-    if unknown:
-        raise CaptureError(f"--check-points {unknown[0]}: {file} has {', '.join(names[:20])}; or say {ALL_POINTS}.")
+def _held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> list[str]:
+    """The names of the file that are meant, without regard to case where that leaves one. Raises CaptureError."""
+    found = []
+    for name in held_out:
+        alike = [each for each in names if each.casefold() == name.casefold()]
+        if name not in names and name.casefold() != ALL_POINTS and len(alike) != 1:
+            raise CaptureError(f"--check-points {name}: {file} has {', '.join(names[:20])}; or say {ALL_POINTS}.")
+        found.append(name if name in names else alike[0] if alike else ALL_POINTS)
+    return found
+
+
+def _check_one_mark(group: Sequence[tuple[_Line, GcpObservation | None]], name: str, file: Path) -> None:
+    """Raise CaptureError where a photograph shows a point at two places."""
+    marked: dict[str, _Line] = {}
+    for line, sighting in group:
+        if sighting is None:
+            continue
+        first = marked.setdefault(sighting.image, line)
+        if math.dist(first.pixel, line.pixel) > _ONE_MARK_PX:
+            raise CaptureError(
+                f"{file}: line {line.number}: the point {name} has another mark in {sighting.image} in line "
+                f"{first.number}. Delete the wrong one, or give one of the points another name."
+            )
 
 
 def _checked(points: list[GroundControlPoint], system: str, file: Path, notes: Sequence[str]) -> GcpList:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from vdgs.captures.coordinate_systems import UNKNOWN_DATUM_M
+from vdgs.geometry.datum_operation import DatumOperation, NoOperation, operation_at
 from vdgs.sfm.exif_gps import Place, plain_text
 
 #: Datums that agree with WGS 84 to a metre or two.
@@ -48,7 +50,7 @@ def to_wgs84(place: Place, gps: Mapping[int, Any]) -> tuple[Place, str, float]:
         remedy = "a table of positions, --gps, whose first line names the system, mends it"
         return place, f"{_of(datum, error_m)}; {remedy}", error_m
     change, error_m = found
-    longitude, latitude = change.transform(place[1], place[0])
+    latitude, longitude, _ = change.to_geodetic(np.array([[place[1], place[0], 0.0]]))[0].tolist()
     if not math.isfinite(latitude + longitude):  # beside a grid
         return place, _of(datum, UNKNOWN_DATUM_M), UNKNOWN_DATUM_M
     return (latitude, longitude), f"positions are of the datum {datum}: converted (good to {error_m:.2g} m)", error_m
@@ -59,7 +61,7 @@ def _of(datum: str, error_m: float) -> str:
 
 
 @lru_cache(maxsize=64)
-def _way(datum: str, latitude: int, longitude: int) -> tuple[Any, float] | None:
+def _way(datum: str, latitude: int, longitude: int) -> tuple[DatumOperation, float] | None:
     """The best way from a datum to WGS 84 near a place, and how good it is in metres; None where PROJ knows none."""
     import pyproj
 
@@ -67,11 +69,8 @@ def _way(datum: str, latitude: int, longitude: int) -> tuple[Any, float] | None:
         crs = pyproj.CRS.from_user_input(datum)
         if not crs.is_geographic:
             return None
-        near: Any = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
-        with warnings.catch_warnings():  # of grids that are not at hand: another way is taken
-            warnings.simplefilter("ignore", UserWarning)
-            ways = pyproj.transformer.TransformerGroup(crs, "EPSG:4326", always_xy=True, area_of_interest=near)
-    except pyproj.exceptions.ProjError:
+        found = operation_at(crs, latitude, longitude)
+    except (pyproj.exceptions.ProjError, NoOperation):
         return None
-    best = next((way for way in ways.transformers if way.accuracy > 0), None)
-    return None if best is None else (best, float(best.accuracy))
+    usable = not (found.is_ballpark or found.made_for) and 0 < found.accuracy_m < math.inf
+    return (found, found.accuracy_m) if usable else None
