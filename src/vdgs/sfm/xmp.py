@@ -59,14 +59,12 @@ def _of_photograph(text: str) -> str:
     while start := _ELSEWHERE.search(text, at):
         kept.append(text[at : start.start()])
         opened = text.find(">", start.end())
-        end = f"</{start[1]}>"
-        closed = text.find(end, opened) if opened > 0 else -1
-        if text[opened - 1 : opened] == "/":
+        if opened >= 0 and text[opened - 1] == "/":
             at = opened + 1
-        elif closed < 0:
-            at = len(text)
-        else:
-            at = closed + len(end)
+            continue
+        end = f"</{start[1]}>"
+        closed = text.find(end, opened) if opened >= 0 else -1
+        at = closed + len(end) if closed >= 0 else len(text)
     return "".join([*kept, text[at:]])
 
 
