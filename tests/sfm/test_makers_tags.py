@@ -254,7 +254,7 @@ ALIKE, ASKEW = (0.15, 0.85, 0.15, 0.85), (0.2, 0.8, 0.1, 0.9)
         pytest.param(crop(*ALIKE), (1915, 1277), 2, True, id="and shrunk"),
         pytest.param(crop(*ASKEW), (3283, 2918), 1, True, id="to another shape"),
         pytest.param(crop(*ASKEW, applied="False"), (3283, 2918), 1, True, id="by its shape"),
-        pytest.param(crop(0.4, 0.7, 0, 1), (1642, 3648), 1, True, id="upright"),
+        pytest.param(crop(0.35, 0.65, 0, 1), (1642, 3648), 1, True, id="upright"),
         pytest.param(crop(*ALIKE, applied="False"), (5472, 3648), 1, False, id="not applied"),
         pytest.param(crop(*ASKEW, applied="False"), (5472, 3648), 1, False, id="another shape, not applied"),
         pytest.param(crop(0, 1, 0, 1), (5472, 3648), 1, False, id="of nothing"),
@@ -289,6 +289,29 @@ def test_a_crop_that_contradicts_the_size_is_doubted_unless_the_picture_is_whole
     whole = read_lens(P4P, {0x920A: 8.8, 0xA405: 24}, packet(crop(*ASKEW) + CALIBRATED), 5472, 3648)
     assert whole is not None
     assert whole.doubt + whole.remark == ""
+
+
+@pytest.mark.parametrize(
+    ("stated", "size", "beside"),
+    [
+        pytest.param(crop(0, 0.5, 0, 0.5), (2736, 1824), "by 60% of", id="upper left"),
+        pytest.param(crop(0.41, 0.71, 0, 1), (1642, 3648), "by 9% of", id="upright"),
+        pytest.param(crop(0.1, 0.9, 0, 0.8), (4378, 2918), "by 8% of", id="upper"),
+        pytest.param(crop(0.26, 0.76, 0.25, 0.75), (2736, 1824), "by 2% of", id="by 55 px of 2736"),
+        pytest.param(crop(0.252, 0.752, 0.252, 0.752), (2736, 1824), "", id="by 13 px of 2736"),
+        pytest.param(crop(0, 0.5, 0, 0.5, applied="False"), (5472, 3648), "", id="not applied"),
+    ],
+)
+def test_a_focal_length_is_not_held_where_a_crop_lies_beside_the_middle(stated, size, beside):
+    """The view meets the middle of the whole: of a crop that is beside it, another pixel than the middle one, which is
+    the one that is assumed."""
+    details = {0x920A: 8.8, 0xA405: 24, 0xA002: size[0], 0xA003: size[1]}
+    lens = read_lens(P4P, details, packet(stated), *size)
+    assert lens is not None
+    assert lens.focal * max(size) == pytest.approx(WHOLE_PX, rel=5e-3)
+    assert lens.doubt.startswith("cropped beside the middle") is bool(beside)
+    assert beside in lens.doubt
+    assert lens.remark.startswith("cropped by a program") is (size[0] < 5472)
 
 
 @pytest.mark.parametrize(

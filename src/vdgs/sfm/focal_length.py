@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vdgs.sfm.exif_gps import plain_text
-from vdgs.sfm.raw_crops import USUAL_SHAPES, read_raw_crop
+from vdgs.sfm.raw_crops import USUAL_SHAPES, RawCrop, read_raw_crop
 from vdgs.sfm.xmp import first_number, text
 
 #: Sensors in millimetres across and down, of cameras that do not say it in EXIF, or say nothing else, by EXIF's model.
@@ -55,6 +55,8 @@ _EDITORS = re.compile(
     r"|acdsee|luminar|snapseed|faststone|photoscape",
     re.IGNORECASE,
 )
+#: A crop whose middle is farther from that of the whole, as a share of its longer side, lies beside it (choice).
+MAX_BESIDE = 0.01
 #: A digital zoom beyond this is damage.
 LARGEST_ZOOM = 100.0
 
@@ -142,11 +144,22 @@ def _framing(details: Mapping[int, Any], xmp: Mapping[str, str], width: int, hei
         original *= crop.part if abs(crop.part * original / longer - 1) < CUT else 1.0
         said = f"cropped by a program (crs:HasCrop in XMP), to {crop.part:.0%} of the longer side"
         sides = crop.shape * WHOLE_PX, WHOLE_PX
-        return _Framing(original, sides, part=crop.part, remark=f"{said}; the focal length is counted for that")
+        remark = f"{said}; the focal length is counted for that"
+        return _Framing(original, sides, part=crop.part, remark=remark, doubt=_beside_middle(crop))
     if cut:  # a picture that was cut has fewer pixels, of the same size
         sides = _number(details.get(0xA002)) or 0.0, _number(details.get(0xA003)) or 0.0
         return _Framing(original, sides, original / longer, remark=unclear, doubt=odd)
     return _Framing(original, (width, height), doubt=_joined(unclear, odd))
+
+
+def _beside_middle(crop: RawCrop) -> str:
+    """What speaks against a lens whose view is assumed to meet the picture in its middle."""
+    if crop.beside <= MAX_BESIDE:
+        return ""
+    return (
+        f"cropped beside the middle (crs:HasCrop in XMP), by {crop.beside:.0%} of the longer side: the view does not "
+        "meet it in its middle, as is assumed; export the photographs without crop"
+    )
 
 
 def _joined(*said: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vdgs.sfm.xmp import first_number, text
 
@@ -22,6 +22,8 @@ class RawCrop:
     """Its longer side over that of the whole."""
     shape: float
     """Longer side of the whole over its shorter."""
+    beside: float = 0.0
+    """How far its middle is from that of the whole, over its longer side."""
 
 
 def read_raw_crop(xmp: Mapping[str, str], width: int, height: int, whole: float | None) -> tuple[RawCrop | None, str]:
@@ -31,10 +33,11 @@ def read_raw_crop(xmp: Mapping[str, str], width: int, height: int, whole: float 
     XMP also keeps crops that nobody applied (in raw files, and in JPEGs that were only developed): of these the pixels
     are whole. Sizes tell it, then the shape, then what the program says (crs:AlreadyApplied).
     """
-    left, right, top, bottom = (first_number(xmp, f"crs:Crop{side}") for side in ("Left", "Right", "Top", "Bottom"))
-    if text(xmp, "crs:HasCrop").lower() != "true" or None in (left, right, top, bottom):
+    edges = [first_number(xmp, f"crs:Crop{side}") for side in ("Left", "Right", "Top", "Bottom")]
+    left, right, top, bottom = (edge or 0.0 for edge in edges)
+    if text(xmp, "crs:HasCrop").lower() != "true" or None in edges:
         return None, ""
-    across, down = (right or 0.0) - (left or 0.0), (bottom or 0.0) - (top or 0.0)
+    across, down = right - left, bottom - top
     if not (0 < across <= 1 and 0 < down <= 1) or across * down == 1:
         return None, ""
     said = text(xmp, "crs:AlreadyApplied").lower() == "true"
@@ -45,7 +48,8 @@ def read_raw_crop(xmp: Mapping[str, str], width: int, height: int, whole: float 
     if found is not None:
         cut = whole is not None and _alike(longer, found.part * whole)
         odd = not any(_alike(aspect, shape) for shape in USUAL_SHAPES)
-        return (found if cut or odd or said else None), ""
+        off = math.hypot((left + right) / 2 - 0.5, ((top + bottom) / 2 - 0.5) / found.shape)
+        return (replace(found, beside=off / found.part) if cut or odd or said else None), ""
     return None, (
         f"cropped by a program, but not as XMP says (crs:HasCrop: {across:.0%} of the width, {down:.0%} of the height "
         f"give no {width} x {height} px of a usual shape); the focal length may be that of the whole"
