@@ -22,7 +22,8 @@ from vdgs.sfm.image_metadata import (
     ImageMetadata,
     attitude_from_aircraft,
     attitude_from_gimbal,
-    read_attitude,
+    likeliest_attitude,
+    read_attitudes,
     read_image_metadata,
 )
 from vdgs.sfm.preflight import make_preflight_report
@@ -73,7 +74,8 @@ def test_angles_under_pix4ds_names_are_those_of_a_body_that_looks_down(angles):
         @ np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
     )
     camera_in_body = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # right, down, forward: top is the nose
-    attitude, said = read_attitude(packet(by_pix4d(*angles)))
+    readings, said = read_attitudes(packet(by_pix4d(*angles)))
+    attitude = likeliest_attitude(readings)
     assert attitude is not None
     assert said == ""
     ned = attitude.camera_from_enu @ np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -117,7 +119,8 @@ def test_whose_angles_stand_under_pix4ds_names_is_one_for_a_camera(tmp_path, pit
     ],
 )  # fmt: skip
 def test_attitudes_under_rarer_names(attributes, elements, expected):
-    attitude, said = read_attitude(packet(attributes, elements))
+    readings, said = read_attitudes(packet(attributes, elements))
+    attitude = likeliest_attitude(readings)
     assert said == ""
     assert attitude is not None
     assert angle_between(attitude, expected) < 1e-3
@@ -163,7 +166,7 @@ def test_tags_of_the_files_that_a_picture_was_made_of_are_not_its_own():
         "<xmpMM:Pantry><rdf:Bag><rdf:li><rdf:Description drone-dji:GimbalPitchDegree='-30' "
         "drone-dji:GimbalYawDegree='5'/></rdf:li></rdf:Bag></xmpMM:Pantry>"
     )
-    assert read_attitude(packet("", pantry)) == (None, "")
+    assert read_attitudes(packet("", pantry)) == ({}, "")
     assert packet("", "<crs:CropTop>0</crs:CropTop><xmpMM:Pantry><a:b>") == {"crs:CropTop": "0"}  # cut off
 
 

@@ -24,7 +24,8 @@ from vdgs.sfm.image_metadata import (
     ImageMetadata,
     attitude_from_aircraft,
     attitude_from_gimbal,
-    read_attitude,
+    likeliest_attitude,
+    read_attitudes,
     read_image_metadata,
 )
 from vdgs.sfm.incremental_mapper import should_fix_focal
@@ -482,7 +483,8 @@ def test_attitudes_are_read_under_every_makers_names(attributes, angles):
     xmp = packet(attributes)
     elements = "".join(f"<{name}>{value}</{name}>" for name, value in xmp.items())
     for values in (xmp, read_xmp(elements.encode())):
-        attitude, said = read_attitude(values)
+        readings, said = read_attitudes(values)
+        attitude = likeliest_attitude(readings)
         assert attitude is not None
         assert said == ""
         assert attitude.camera_from_enu == pytest.approx(attitude_from_gimbal(*angles).camera_from_enu, abs=1e-9)
@@ -494,7 +496,8 @@ def test_a_camera_inside_a_structure_is_not_mistaken_for_the_vehicle():
         "</d:VehicleOrientationNED><d:CameraOrientationNED rdf:parseType='Resource'><d:Yaw>30</d:Yaw>"
         "<d:Pitch>-60</d:Pitch><d:Roll>0</d:Roll></d:CameraOrientationNED>"
     )
-    attitude, _ = read_attitude(read_xmp(structure.encode()))
+    readings, _ = read_attitudes(read_xmp(structure.encode()))
+    attitude = likeliest_attitude(readings)
     assert attitude is not None
     assert attitude.camera_from_enu == pytest.approx(attitude_from_gimbal(30, -60, 0).camera_from_enu)
 
@@ -512,7 +515,7 @@ def test_a_camera_inside_a_structure_is_not_mistaken_for_the_vehicle():
     ],
 )  # fmt: skip
 def test_defaults_and_halves_of_attitudes_are_none(attributes, said):
-    assert read_attitude(packet(attributes)) == (None, said)
+    assert read_attitudes(packet(attributes)) == ({}, said)
 
 
 def test_the_same_level_view_in_all_photographs_is_a_default(tmp_path):

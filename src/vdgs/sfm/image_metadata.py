@@ -72,7 +72,7 @@ def attitude_from_aircraft(heading_deg: float, pitch_deg: float, roll_deg: float
     return Attitude(np.stack([wing, -nose, belly]) @ enu)
 
 
-#: What `read_attitude` says of angles that are no measurement.
+#: What `read_attitudes` says of angles that are no measurement.
 DEFAULT_ANGLES = "all angles of the camera are exactly 0: a default, no measurement; not used"
 #: Without its heading a view is believed only where it looks so nearly down that the heading hardly matters (degrees).
 NEARLY_DOWN_DEG = 20.0
@@ -103,17 +103,6 @@ _WAYS: tuple[tuple[Any, ...], ...] = (
 )
 
 
-def read_attitude(xmp: Mapping[str, str]) -> tuple[Attitude | None, str]:
-    """Where the camera looked, or None, and what people should know of it.
-
-    By the gimbal (DJI and those who write as it does, Parrot, Skydio, Yuneec), or as a body that looks down when level:
-    Pix4D's names, and the aircraft that the camera is fixed to (senseFly). Angles that are all exactly 0 are those of a
-    program that knew none.
-    """
-    readings, said = _read_attitudes(xmp)
-    return _by_pitch(readings), said
-
-
 def looks_backwards(*photographs: Mapping[str, Attitude]) -> bool:
     """Whether angles are the gimbal's where their names define those of a body (`ImageMetadata.attitudes`): as many
     cameras would look backwards as bodies as would look up by the gimbal."""
@@ -122,13 +111,19 @@ def looks_backwards(*photographs: Mapping[str, Attitude]) -> bool:
     return 0 < backwards >= sum(pitch > 0 for pitch in pitches)
 
 
-def _by_pitch(readings: Mapping[str, Attitude]) -> Attitude | None:
+def likeliest_attitude(readings: Mapping[str, Attitude]) -> Attitude | None:
     """The reading that the pitch of one photograph speaks for: the first, as the names define it, mostly."""
     return readings[GIMBAL] if looks_backwards(readings) else next(iter(readings.values()), None)
 
 
-def _read_attitudes(xmp: Mapping[str, str]) -> tuple[dict[str, Attitude], str]:
-    """Where the camera looked by all readings that the names leave open, the defined one first; one mostly."""
+def read_attitudes(xmp: Mapping[str, str]) -> tuple[dict[str, Attitude], str]:
+    """Where the camera looked by all readings that the names leave open, the defined one first, one mostly; none for no
+    measurement. And what people should know of it.
+
+    By the gimbal (DJI and those who write as it does, Parrot, Skydio, Yuneec), or as a body that looks down when level:
+    Pix4D's names, and the aircraft that the camera is fixed to (senseFly). Angles that are all exactly 0 are those of a
+    program that knew none.
+    """
     for names, *readings in _WAYS:
         yaw, pitch, roll = (first_number(xmp, name) for name in names)
         if pitch is None:
@@ -143,7 +138,7 @@ def _read_attitudes(xmp: Mapping[str, str]) -> tuple[dict[str, Attitude], str]:
         for reading in readings:
             from_angles, sign = _READINGS[reading]
             found[reading] = from_angles(yaw or 0.0, pitch, sign * (roll or 0.0))
-        attitude = _by_pitch(found)
+        attitude = likeliest_attitude(found)
         known = attitude is not None and (yaw is not None or attitude.tilt_deg < NEARLY_DOWN_DEG)
         return (found if known else {}), ""
     return {}, ""
@@ -306,7 +301,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
     if place is not None and not in_xmp:
         place, datum, datum_error_m = to_wgs84(place, gps)
     (altitude, altitude_type), both = read_altitudes(gps, xmp)
-    attitudes, default = _read_attitudes(xmp)
+    attitudes, default = read_attitudes(xmp)
     if orientation != 1:
         attitudes = {}
     if GIMBAL in attitudes and plain_text(tags.get(0x0110)).upper() in _GIMBALS_UNDER_PIX4D:
@@ -330,7 +325,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         datum_error_m=datum_error_m,
         fix="" if in_xmp else read_fix(gps),
         relative_altitude=first_number(xmp, *_OVER_TAKE_OFF) or None,
-        attitude=_by_pitch(attitudes),
+        attitude=likeliest_attitude(attitudes),
         attitudes=attitudes if len(attitudes) > 1 else {},
         file_bytes=size,
         has_alpha_channel=found.has_alpha_channel,
