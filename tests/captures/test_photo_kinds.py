@@ -140,7 +140,7 @@ def test_tiffs_are_taken_as_their_files_have_them(tmp_path, orientation, kind):
     assert verify_image(file).has_content
 
 
-@pytest.mark.parametrize("kind", [TiffTags.BYTE, TiffTags.SHORT, TiffTags.LONG])
+@pytest.mark.parametrize("kind", [TiffTags.BYTE, TiffTags.SHORT, TiffTags.LONG, TiffTags.LONG8])
 @pytest.mark.parametrize("values", ["<u2", ">u2"])
 def test_the_orientation_of_a_tiff_is_set_by_its_type_and_order_of_bytes(tmp_path, kind, values):
     """Half a number would be another one, or none."""
