@@ -38,8 +38,9 @@ def with_unstated(deviations: np.ndarray, are_stated: np.ndarray) -> np.ndarray:
 
 
 def relative_deviations(deviations: np.ndarray) -> np.ndarray | None:
-    """Deviations [n, k] over their median on each axis; None where all are about alike."""
-    if not len(deviations):
+    """Deviations [n, k] over their median on each axis; None where all count alike: they differ little, or are so few
+    that a fit could follow each, of whose accuracy residuals then tell nothing."""
+    if len(deviations) < ENOUGH_TO_DOUBT:
         return None
     relative = deviations / np.median(deviations, axis=0)
     if (relative.max(axis=0) <= ALIKE_TIMES * relative.min(axis=0)).all():
@@ -55,6 +56,12 @@ def are_told(deviations: np.ndarray, are_stated: np.ndarray) -> bool:
     weights = 1 / deviations**2
     shares = weights[are_stated].sum(axis=0) / weights.sum(axis=0)
     return bool(are_stated.sum() >= ENOUGH_TO_DOUBT and (shares >= NEARLY_ALL).all())
+
+
+def of_alike(deviations: np.ndarray) -> np.ndarray:
+    """The deviation [k] of positions [n, k] that count alike whatever they state: the root mean square, for of few one
+    that is off by metres moves the fit of all."""
+    return np.asarray(np.sqrt((deviations**2).mean(axis=0)))
 
 
 def weighing_note(deviations: np.ndarray, inliers: np.ndarray) -> str:
@@ -84,12 +91,7 @@ def as_many(deviations: np.ndarray) -> np.ndarray:
 
 def agreed(relative: np.ndarray, residuals: np.ndarray, leverages: np.ndarray) -> np.ndarray:
     """By how many times positions [n, 3] are worse than those that count, as they are stated and as far as residuals
-    [n, 3] agree: across together, and up. `leverages` [n, 3] is by how much the fit follows each of them.
-
-    So few that the fit could follow each say nothing of their accuracy; it then counts as that of more.
-    """
-    if len(relative) < ENOUGH_TO_DOUBT:
-        return relative
+    [n, 3] agree: across together, and up. `leverages` [n, 3] is by how much the fit follows each of them."""
     free = residuals / np.sqrt(np.clip(1 - leverages, LEAST_FREE, 1.0))
     across = _shared(relative[:, :2], free[:, :2])
     up = _shared(relative[:, 2:], free[:, 2:]) if residuals[:, 2].any() else 0.0
