@@ -11,7 +11,7 @@ from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, Sour
 from vdgs.captures.ground_estimation import find_ground_frame
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
-from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
+from vdgs.captures.position_weights import agreed, are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.geodesy import geodetic_from_enu
 
@@ -117,6 +117,20 @@ def test_few_positions_count_alike_whatever_they_say(count, good, off_m):
         within += [error[0] <= fit.place_error_m[0], error[2] <= fit.place_error_m[1]]
         within += [abs(fit.similarity.scale / 13 - 1) <= fit.scale_error]
     assert np.mean(within) >= 0.9
+
+
+@pytest.mark.parametrize("off_m", [0.02, 0.5, 2.0])
+def test_more_positions_of_the_same_accuracy_tell_the_same(off_m):
+    """Thousands, of which some tell most, as those that they repeat."""
+    rng, worse = np.random.default_rng(0), bad(0.5, 0)[:-1, None]
+    relative = relative_deviations(np.where(worse, 2.0, 0.02) * AXES)
+    assert relative is not None
+    residuals = np.where(worse, 2.0, off_m) * AXES * rng.normal(size=relative.shape)
+    few, many = (
+        agreed(*(np.tile(each, (times, 1)) for each in (relative, residuals, np.zeros_like(relative))))
+        for times in (1, 60)
+    )
+    assert many == pytest.approx(np.tile(few, (60, 1)), rel=1e-6)
 
 
 def test_accuracies_in_a_table_count_for_a_capture_with_poses(tmp_path):

@@ -24,6 +24,8 @@ GOOD_TIMES = 4.0
 TAILS = 3.0
 #: What is shared is looked for in steps by this factor; rounds in which the spread of residuals settles.
 STEP, ROUNDS = 1.5, 12
+#: Of many positions no more than so many tell it before the last rounds, for the sake of time.
+SOME, LAST_ROUNDS = 500, 2
 #: Of a residual at least this share is left where the fit follows its position.
 LEAST_FREE = 0.1
 
@@ -104,13 +106,22 @@ def _shared(relative: np.ndarray, residuals: np.ndarray) -> float:
     least, most = relative.min() / 2, 16 * relative.max()
     steps = 1 + int(np.ceil(np.log(most / least) / np.log(STEP)))
     floors = np.append(0.0, np.geomspace(least, most, steps))
-    weights = np.hypot(relative, floors[:, None, None])
-    enough = np.array([as_many(each).min() >= ENOUGH_TO_DOUBT - 0.5 for each in weights])
-    squares = ((residuals / weights) ** 2).reshape(len(floors), -1)
-    spread = np.maximum(np.median(squares, axis=1, keepdims=True), 1e-12)
-    for _ in range(ROUNDS):
-        spread = ((TAILS + 1) * squares / (TAILS + squares / spread)).mean(axis=1, keepdims=True)
-        spread = np.maximum(spread, 1e-12)
-    cost = (0.5 * (TAILS + 1) * np.log1p(squares / spread / TAILS) + 0.5 * np.log(spread)).sum(axis=1)
-    cost += np.log(weights).sum(axis=(1, 2))
+    weights = 1 / (np.ascontiguousarray(relative.T) ** 2 + floors[:, None, None] ** 2)
+    squares = residuals.T**2 * weights
+    enough = (weights.sum(axis=2) ** 2 / (weights**2).sum(axis=2)).min(axis=1) >= ENOUGH_TO_DOUBT - 0.5
+    spread = _spread(squares)
+    ratios = squares / (TAILS * spread[:, None, None])
+    cost = (TAILS + 1) * np.log1p(ratios).sum(axis=(1, 2)) - np.log(weights).sum(axis=(1, 2))
+    cost += residuals.size * np.log(spread)
     return float(floors[np.where(enough, cost, np.inf).argmin()])
+
+
+def _spread(squares: np.ndarray) -> np.ndarray:
+    """Of squares [m, k, n] the variance [m] of Student's t that they have: some of many positions tell it up to the
+    last rounds."""
+    some = squares[:, :, :: 1 + squares.shape[2] // SOME].copy()
+    spread = np.maximum(np.median(some, axis=(1, 2)), 1e-12)
+    for part in [some] * (ROUNDS - LAST_ROUNDS) + [squares] * LAST_ROUNDS:
+        found = (part / (TAILS + part / spread[:, None, None])).mean(axis=(1, 2))
+        spread = np.maximum((TAILS + 1) * found, 1e-12)
+    return np.asarray(spread)
