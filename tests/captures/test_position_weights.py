@@ -11,7 +11,7 @@ from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, Sour
 from vdgs.captures.ground_estimation import find_ground_frame
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
-from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
+from vdgs.captures.position_weights import agreed, are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.geodesy import geodetic_from_enu
 
@@ -22,18 +22,20 @@ COUNT = 48
 def fitted(off_m: np.ndarray, said_m: np.ndarray, seed: int, weighed: bool = True) -> tuple[PositionFit, np.ndarray]:
     """The fit of strips whose positions are off by normal errors [n] (one standard deviation) where receivers say
     `said_m` [n] (NaN for nothing), and by how much the places are off [3]."""
-    rng = np.random.default_rng(seed)
-    strip, k = np.divmod(np.arange(COUNT), 8)
-    places = np.stack([25.0 * np.where(strip % 2, 7 - k, k), 30.0 * strip, 75 + rng.normal(0, 2, COUNT)], axis=1)
+    rng, count = np.random.default_rng(seed), len(off_m)
+    long = 8 if count >= 16 else 2
+    strip, k = np.divmod(np.arange(count), long)
+    along = 25.0 * np.where(strip % 2, long - 1 - k, k)
+    places = np.stack([along, 30.0 * strip, 75 + rng.normal(0, 2, count)], axis=1)
     turn = Rotation.random(random_state=seed).as_matrix()
     askew = Rotation.from_rotvec([*rng.normal(0, np.radians(1.5), 2), 0]).as_matrix()
     said = np.isfinite(said_m)
     deviations = with_unstated(np.where(said, said_m, 1.0)[:, None] * AXES, said)
-    recorded = places + off_m[:, None] * AXES * rng.normal(size=(COUNT, 3))
+    recorded = places + off_m[:, None] * AXES * rng.normal(size=(count, 3))
     fit = fit_positions(
         Problem(
             centers=places @ turn / 13 + [1.0, -2, 3], targets=recorded,
-            times=np.linspace(0, 1, COUNT), up=Up(turn.T @ askew @ [0.0, 0, 1], 2.0, "the views"),
+            times=np.linspace(0, 1, count), up=Up(turn.T @ askew @ [0.0, 0, 1], 2.0, "the views"),
             stated=deviations if are_told(deviations, said) else None,
             relative=relative_deviations(deviations) if weighed else None,
         )
@@ -100,6 +102,35 @@ def test_positions_that_state_about_the_same_count_alike(said_m):
     other, _ = fitted(np.full(COUNT, said_m), said, 0, weighed=False)
     assert np.array_equal(one.placed, other.placed)
     assert weighing_note(one.deviations, one.inliers) == ""
+
+
+@pytest.mark.parametrize(("count", "good"), [(5, 2), (5, 3), (3, 2)])
+@pytest.mark.parametrize("off_m", [0.02, 1.5])
+def test_few_positions_count_alike_whatever_they_say(count, good, off_m):
+    """A fit can follow each of few: none shows whether what it says is true."""
+    within = []
+    for seed in range(12):
+        best = np.random.default_rng(seed).permutation(count) < good
+        fit, error = fitted(np.where(best, off_m, 3.0), np.where(best, 0.02, 3.0), seed)
+        assert (fit.deviations == fit.gps_std).all()
+        assert weighing_note(fit.deviations, fit.inliers) == ""
+        within += [error[0] <= fit.place_error_m[0], error[2] <= fit.place_error_m[1]]
+        within += [abs(fit.similarity.scale / 13 - 1) <= fit.scale_error]
+    assert np.mean(within) >= 0.9
+
+
+@pytest.mark.parametrize("off_m", [0.02, 0.5, 2.0])
+def test_more_positions_of_the_same_accuracy_tell_the_same(off_m):
+    """Thousands, of which some tell most, as those that they repeat."""
+    rng, worse = np.random.default_rng(0), bad(0.5, 0)[:-1, None]
+    relative = relative_deviations(np.where(worse, 2.0, 0.02) * AXES)
+    assert relative is not None
+    residuals = np.where(worse, 2.0, off_m) * AXES * rng.normal(size=relative.shape)
+    few, many = (
+        agreed(*(np.tile(each, (times, 1)) for each in (relative, residuals, np.zeros_like(relative))))
+        for times in (1, 60)
+    )
+    assert many == pytest.approx(np.tile(few, (60, 1)), rel=1e-6)
 
 
 def test_accuracies_in_a_table_count_for_a_capture_with_poses(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri, fdtri, stdtrit
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
-from vdgs.captures.position_weights import agreed, as_many, typical
+from vdgs.captures.position_weights import agreed, as_many, of_alike, typical
 from vdgs.geometry.similarity import Similarity, rotation_about
 
 #: From so many on, east and north have a standard deviation each; of fewer they share one.
@@ -194,7 +194,7 @@ def _said(problem: Problem, inliers: np.ndarray) -> np.ndarray | None:
     """The deviation [3] that receivers state of the positions that count; None where they state none."""
     if problem.stated is None:
         return None
-    return typical(problem.stated[inliers]) if problem.relative is not None else np.median(problem.stated, axis=0)
+    return typical(problem.stated[inliers]) if problem.relative is not None else of_alike(problem.stated)
 
 
 def _residuals(problem: Problem, state: _State, middle: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -228,7 +228,7 @@ def _deviations(residuals: np.ndarray, model: str, stated: np.ndarray | None, ro
             squares[:2] = squares[:2].mean()
         found = np.sqrt(squares)
     else:
-        usual = np.array([USUAL_M[0], USUAL_M[0], USUAL_M[1]]) if stated is None else np.median(stated, axis=0)
+        usual = np.array([USUAL_M[0], USUAL_M[0], USUAL_M[1]]) if stated is None else of_alike(stated)
         plane = (residuals[:, :2] ** 2).sum() / 2
         sums = np.array([plane, plane, (residuals[:, 2] ** 2).sum()])
         found = np.sqrt((sums + usual**2) / (np.maximum(count - unknowns, 0) + 1))

@@ -24,6 +24,8 @@ GOOD_TIMES = 4.0
 TAILS = 3.0
 #: What is shared is looked for in steps by this factor; rounds in which the spread of residuals settles.
 STEP, ROUNDS = 1.5, 12
+#: Of many positions no more than so many tell it before the last rounds, for the sake of time.
+SOME, LAST_ROUNDS = 500, 2
 #: Of a residual at least this share is left where the fit follows its position.
 LEAST_FREE = 0.1
 
@@ -38,8 +40,9 @@ def with_unstated(deviations: np.ndarray, are_stated: np.ndarray) -> np.ndarray:
 
 
 def relative_deviations(deviations: np.ndarray) -> np.ndarray | None:
-    """Deviations [n, k] over their median on each axis; None where all are about alike."""
-    if not len(deviations):
+    """Deviations [n, k] over their median on each axis; None where all count alike: they differ little, or are so few
+    that a fit could follow each, of whose accuracy residuals then tell nothing."""
+    if len(deviations) < ENOUGH_TO_DOUBT:
         return None
     relative = deviations / np.median(deviations, axis=0)
     if (relative.max(axis=0) <= ALIKE_TIMES * relative.min(axis=0)).all():
@@ -55,6 +58,12 @@ def are_told(deviations: np.ndarray, are_stated: np.ndarray) -> bool:
     weights = 1 / deviations**2
     shares = weights[are_stated].sum(axis=0) / weights.sum(axis=0)
     return bool(are_stated.sum() >= ENOUGH_TO_DOUBT and (shares >= NEARLY_ALL).all())
+
+
+def of_alike(deviations: np.ndarray) -> np.ndarray:
+    """The deviation [k] of positions [n, k] that count alike whatever they state: the root mean square, for of few one
+    that is off by metres moves the fit of all."""
+    return np.asarray(np.sqrt((deviations**2).mean(axis=0)))
 
 
 def weighing_note(deviations: np.ndarray, inliers: np.ndarray) -> str:
@@ -84,12 +93,7 @@ def as_many(deviations: np.ndarray) -> np.ndarray:
 
 def agreed(relative: np.ndarray, residuals: np.ndarray, leverages: np.ndarray) -> np.ndarray:
     """By how many times positions [n, 3] are worse than those that count, as they are stated and as far as residuals
-    [n, 3] agree: across together, and up. `leverages` [n, 3] is by how much the fit follows each of them.
-
-    So few that the fit could follow each say nothing of their accuracy; it then counts as that of more.
-    """
-    if len(relative) < ENOUGH_TO_DOUBT:
-        return relative
+    [n, 3] agree: across together, and up. `leverages` [n, 3] is by how much the fit follows each of them."""
     free = residuals / np.sqrt(np.clip(1 - leverages, LEAST_FREE, 1.0))
     across = _shared(relative[:, :2], free[:, :2])
     up = _shared(relative[:, 2:], free[:, 2:]) if residuals[:, 2].any() else 0.0
@@ -102,13 +106,22 @@ def _shared(relative: np.ndarray, residuals: np.ndarray) -> float:
     least, most = relative.min() / 2, 16 * relative.max()
     steps = 1 + int(np.ceil(np.log(most / least) / np.log(STEP)))
     floors = np.append(0.0, np.geomspace(least, most, steps))
-    weights = np.hypot(relative, floors[:, None, None])
-    enough = np.array([as_many(each).min() >= ENOUGH_TO_DOUBT - 0.5 for each in weights])
-    squares = ((residuals / weights) ** 2).reshape(len(floors), -1)
-    spread = np.maximum(np.median(squares, axis=1, keepdims=True), 1e-12)
-    for _ in range(ROUNDS):
-        spread = ((TAILS + 1) * squares / (TAILS + squares / spread)).mean(axis=1, keepdims=True)
-        spread = np.maximum(spread, 1e-12)
-    cost = (0.5 * (TAILS + 1) * np.log1p(squares / spread / TAILS) + 0.5 * np.log(spread)).sum(axis=1)
-    cost += np.log(weights).sum(axis=(1, 2))
+    weights = 1 / (np.ascontiguousarray(relative.T) ** 2 + floors[:, None, None] ** 2)
+    squares = residuals.T**2 * weights
+    enough = (weights.sum(axis=2) ** 2 / (weights**2).sum(axis=2)).min(axis=1) >= ENOUGH_TO_DOUBT - 0.5
+    spread = _spread(squares)
+    ratios = squares / (TAILS * spread[:, None, None])
+    cost = (TAILS + 1) * np.log1p(ratios).sum(axis=(1, 2)) - np.log(weights).sum(axis=(1, 2))
+    cost += residuals.size * np.log(spread)
     return float(floors[np.where(enough, cost, np.inf).argmin()])
+
+
+def _spread(squares: np.ndarray) -> np.ndarray:
+    """Of squares [m, k, n] the variance [m] of Student's t that they have: some of many positions tell it up to the
+    last rounds."""
+    some = squares[:, :, :: 1 + squares.shape[2] // SOME].copy()
+    spread = np.maximum(np.median(some, axis=(1, 2)), 1e-12)
+    for part in [some] * (ROUNDS - LAST_ROUNDS) + [squares] * LAST_ROUNDS:
+        found = (part / (TAILS + part / spread[:, None, None])).mean(axis=(1, 2))
+        spread = np.maximum((TAILS + 1) * found, 1e-12)
+    return np.asarray(spread)
