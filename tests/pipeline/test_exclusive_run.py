@@ -197,7 +197,7 @@ def test_a_look_refuses_photographs_for_a_run_that_was_trained_on_a_capture(run,
     request = RunRequest(capture=take_photographs(tmp_path / "card"), output=run.path, threads=1, device="cpu")
     before = contents(run)
     for act in (estimate_run, reconstruct_if_needed):
-        with pytest.raises(RunError, match="is a run of the capture .*, not of these photographs"):
+        with pytest.raises(RunError, match=r"is a run of the capture .*, not of these photographs"):
             act(request, Console(file=io.StringIO()))
     assert contents(run) == before
 
