@@ -25,6 +25,12 @@ def discard_training(output: Path, run: RunFolder | None) -> None:
     Workspace(output).forget(ANEW)
 
 
+def forget_agreement(output: Path) -> None:
+    """Take back what `agree_to_discard` recorded: a capture that is there already was asked for meanwhile."""
+    if Workspace(output).has_begun(ANEW):
+        Workspace(output).forget(ANEW)
+
+
 def check_nothing_trained(request: SfmRequest, run: RunFolder | None, key: str | None = None) -> None:
     """Raise RunError where a capture is about to change that a run was trained on, unless work of this `key` was begun
     with --overwrite. None: no work was begun."""
