@@ -15,6 +15,7 @@ from rich.console import Console
 
 from support.captures import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from support.commands import vdgs
+from vdgs.captures import image_files
 from vdgs.captures.formats.colmap_records import MAX_OBSERVATIONS
 from vdgs.captures.image_checks import check_images, detect_rounding
 from vdgs.captures.loading import load_capture
@@ -223,6 +224,14 @@ def test_masks_are_counted(folder, scene):
     assert check_images(capture).masked_fraction == pytest.approx(0.5)
     assert not capture.warnings
     assert "Masks of 12 of 12 photographs; 50.0% masked out" in printed(capture, folder / "out")
+
+
+def test_each_mask_is_decoded_once_for_its_pixels(folder, scene, monkeypatch):
+    write_masks(folder, scene.cameras, left_out=60)
+    capture, decoded, decode = load_capture(folder), [], image_files._decode
+    monkeypatch.setattr(image_files, "_decode", lambda path: decoded.append(path) or decode(path))
+    check_images(capture)
+    assert sorted(decoded) == sorted(view.mask_path for view in capture.views)
 
 
 def test_gray_that_masks_leave_out_is_told(folder, scene):

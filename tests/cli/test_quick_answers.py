@@ -295,6 +295,39 @@ def test_a_photograph_that_is_removed_beside_the_run_is_missed(native_small: Nat
     assert nothing_to_do(asked, command) == ""
 
 
+def test_photographs_that_were_renamed_or_removed_before_the_capture_was_made_anew_are_not_missed(
+    native_small: NativeRun, tmp_path
+):
+    """Digests of their former names are kept; one of two copies that was used is missed all the same."""
+    place, command = tmp_path / "DCIM", "vdgs run DCIM --output DCIM/run"
+    shutil.copytree(native_small.capture / "images", place)
+    photographs = sorted(place.iterdir())
+    photographs.append(Path(shutil.copy(photographs[0], place / "copy.png")))
+    run = RunFolder(shutil.copytree(native_small.whole, place / "run"))
+    own = run.settings()
+    run.config.write(own, command)
+    asked = RunRequest(capture=place, output=run.path, ortho=False, options=own.capture, **vars(own.method))
+    vdgs("report", run.path)
+    set_time(run.capture_file, 100)
+
+    def make_anew():
+        digests = read_digests(run.own_capture)
+        files = tuple(SourceFile(file.name, digests.of(file), "") for file in photographs)
+        SourceImages(folders=(str(place),), files=files, command=command).write(run.own_capture)
+        digests.write()
+
+    make_anew()
+    assert nothing_to_do(asked, command).startswith("nothing to do")
+    photographs.pop().unlink()
+    assert nothing_to_do(asked, command) == ""
+    make_anew()
+    assert nothing_to_do(asked, command).startswith("nothing to do")
+    photographs.append(photographs.pop(0).rename(place / "renamed.png"))
+    assert nothing_to_do(asked, command) == ""
+    make_anew()
+    assert nothing_to_do(asked, command).startswith("nothing to do")
+
+
 def test_a_folder_that_an_option_names_is_looked_at_with_all_below(tmp_path):
     place, mask = tmp_path / "place", tmp_path / "masks" / "below" / "new.png"
     place.mkdir()

@@ -26,6 +26,7 @@ from vdgs.config.presets import PRESETS
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import RunError
+from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.runs.create_or_resume import create_or_resume_run, exclusive_run
 from vdgs.runs.run_folder import RunFolder
@@ -168,13 +169,17 @@ def test_a_bench_does_not_begin_what_another_process_drives(run, place):
         assert contents(run) == before
 
 
-def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path):
-    photographs, run = tmp_path / "card", RunFolder(tmp_path / "run")
-    photographs.mkdir()
+def take_photographs(folder: Path) -> Path:
+    folder.mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
     for k in range(6):
         place = np.array([10.0 * (k % 3), 12.0 * (k // 3), 40.0 + k % 2])
-        write_photograph(photographs / f"p{k}.jpg", np.roll(noise, k, axis=0), k, place)
+        write_photograph(folder / f"p{k}.jpg", np.roll(noise, k, axis=0), k, place)
+    return folder
+
+
+def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path):
+    photographs, run = take_photographs(tmp_path / "card"), RunFolder(tmp_path / "run")
     request = RunRequest(
         capture=photographs,
         output=run.path,
@@ -186,6 +191,15 @@ def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path)
     with driven_elsewhere(run), pytest.raises(RunError, match=AT_WORK):
         reconstruct_if_needed(request, Console(file=io.StringIO()))
     assert not run.own_capture.exists()
+
+
+def test_a_look_refuses_photographs_for_a_run_that_was_trained_on_a_capture(run, tmp_path):
+    request = RunRequest(capture=take_photographs(tmp_path / "card"), output=run.path, threads=1, device="cpu")
+    before = contents(run)
+    for act in (estimate_run, reconstruct_if_needed):
+        with pytest.raises(RunError, match=r"is a run of the capture .*, not of these photographs"):
+            act(request, Console(file=io.StringIO()))
+    assert contents(run) == before
 
 
 def test_a_run_among_other_files_leaves_nothing_there(place, tmp_path):

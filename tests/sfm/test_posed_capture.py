@@ -28,18 +28,20 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import WORK_FOLDER
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
-from vdgs.config.sfm_options import SfmRequest
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import ecef_from_geodetic, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
+from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import feature_extraction, feature_matching, posed_capture, workspace
 from vdgs.sfm.posed_capture import make_posed_capture
 from vdgs.sfm.posed_photographs import FEATURES, _in_metres, read_posed_photographs
 from vdgs.sfm.posed_plan import plan_posed_capture
 from vdgs.sfm.random_points import random_points
 from vdgs.sfm.workspace import Workspace
+from vdgs.system.atomic_files import write_json
 
 pytestmark = [pytest.mark.xdist_group("sfm"), pytest.mark.slow]  # whole reconstructions, runs or trainings
 
@@ -215,6 +217,27 @@ def _some_photographs(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> 
 
 def _stop(*_: object) -> None:
     raise KeyboardInterrupt
+
+
+@pytest.mark.usefixtures("few_features")
+def test_an_agreement_to_discard_what_was_trained_ends_where_the_old_capture_is_asked_for(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, flight = _some_photographs(town_flight, tmp_path)
+    project_writers.write_realityscan_csv(root / "cameras.csv", flight)
+    run, said = RunFolder(tmp_path / "run"), Console(file=io.StringIO())
+    same = SfmRequest(image_folders=(root,), output=run.own_capture, threads=2)
+    anew = replace(same, options=SfmOptions(max_output_size=200))
+    make_posed_capture(same, CaptureOptions(), said, run)
+    write_json(run.capture_file, {})  # as training leaves it
+    monkeypatch.setattr(posed_capture, "_match", _stop)
+    for request in (replace(anew, overwrite=True), anew):  # the same command goes on, whose --overwrite is not kept
+        with pytest.raises(KeyboardInterrupt):
+            make_posed_capture(request, CaptureOptions(), said, run)
+    make_posed_capture(same, CaptureOptions(), said, run)  # it is there as it was
+    with pytest.raises(VdgsError, match="--overwrite"):
+        make_posed_capture(anew, CaptureOptions(), said, run)
+    assert run.is_trained
 
 
 @pytest.mark.usefixtures("few_features")

@@ -11,7 +11,7 @@ import numpy as np
 
 from vdgs.captures.capture import Capture, View, spread_evenly
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.image_files import gray_fraction, gray_masks_note, kept_fraction, verify_image
+from vdgs.captures.image_files import gray_masks_note, masked_shares, verify_image
 from vdgs.errors import CaptureError
 from vdgs.system.content_digests import find_copies
 
@@ -113,10 +113,9 @@ def _check_view(view: View) -> _CheckedView:
         photograph = verify_image(view.image_path)
         if view.mask_path is not None:
             verify_image(view.mask_path)
-        kept = kept_fraction(view.image_path, view.mask_path, photograph.has_alpha_channel)
+        kept, gray = masked_shares(view.image_path, view.mask_path, photograph.has_alpha_channel)
     except CaptureError as error:
         return _CheckedView(view.name, str(error))
-    gray = 0.0 if view.mask_path is None else gray_fraction(view.mask_path)
     return _CheckedView(view.name, None, not photograph.has_content, kept, gray)
 
 

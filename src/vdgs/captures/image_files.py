@@ -295,6 +295,8 @@ def _mask(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 def _lightness(mask: Path, pixels: np.ndarray) -> np.ndarray:
     """The brightest channel of a mask at its own size, [h, w] uint8."""
+    if pixels.ndim == 2 and pixels.dtype == np.uint8:
+        return pixels
     if pixels.dtype == np.uint16 and pixels.size and pixels.max() <= 255:  # 8 bits, written as 16
         return pixels.reshape(*pixels.shape[:2], -1)[..., :3].max(axis=2).astype(np.uint8)
     return _in_rgb(mask, pixels)[0].max(axis=2)
@@ -431,7 +433,11 @@ def _why_nothing(mask: Path, pixels: np.ndarray) -> str:
 def gray_fraction(mask: Path) -> float:
     """The share of a mask that is left out though it is not black; 0 where black is kept, where values are 0 and 1, and
     where transparency says what is kept. Raises `CaptureError` for a mask that cannot be decoded."""
-    pixels = _decode(mask)
+    return _gray(mask, _decode(mask))
+
+
+def _gray(mask: Path, pixels: np.ndarray) -> float:
+    """As `gray_fraction`, of a mask's pixels as they are stored."""
     if mask.name.lower().startswith(DYNAMIC_MASK) or (pixels.ndim == 3 and pixels.shape[2] == 4):
         return 0.0
     light = _lightness(mask, pixels)
@@ -451,16 +457,17 @@ def gray_masks_note(shares: Mapping[Path, float]) -> list[str]:
     ]
 
 
-def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:
-    """The share of a photograph that its mask and its transparency keep; 1 without either.
+def masked_shares(photograph: Path, mask: Path | None, may_be_transparent: bool) -> tuple[float, float]:
+    """The share of a photograph that its mask and its transparency keep, 1 without either, and the `gray_fraction` of
+    its mask, 0 without one; each file is decoded once.
 
-    Raises `CaptureError` where they keep nothing.
+    Raises `CaptureError` where nothing is kept.
     """
-    opaque = decode_image(photograph)[1] if may_be_transparent else None
-    keep = opaque
+    keep = opaque = decode_image(photograph)[1] if may_be_transparent else None
+    gray = 0.0
     if mask is not None:
         pixels = _decode(mask)
-        kept = _mask(mask, pixels)
+        kept, gray = _mask(mask, pixels), _gray(mask, pixels)
         if not kept.any():
             raise CaptureError(
                 f"{mask}: leaves nothing of its photograph. {_why_nothing(mask, pixels)}, or remove the photograph "
@@ -472,4 +479,4 @@ def kept_fraction(photograph: Path, mask: Path | None, may_be_transparent: bool)
             f"{photograph}: is transparent everywhere that it is not masked; nothing of it is left. Remove its "
             "alpha channel, or the photograph from the model."
         )
-    return 1.0 if keep is None else float(keep.mean())
+    return 1.0 if keep is None else float(keep.mean()), gray

@@ -120,7 +120,7 @@ def select_rows(
     """
     rows = {}
     for path, frame in frames.items():
-        far, reach = _distances(path, frame, means)
+        far, reach, why = _distances(path, frame, means)
         beyond = far >= reach
         share = float(pixels[beyond].sum() / pixels.sum())
         if share > MAX_DROPPED_SHARE:
@@ -128,8 +128,8 @@ def select_rows(
         elif beyond.any():
             console.print(
                 f"[yellow]note[/] {path.name}: {np.count_nonzero(beyond):,} of {len(means):,} Gaussians lie more than "
-                f"{reach:.4g} units away, where the format does not reach; they are left out. They make "
-                f"{share:.2g} of what the training cameras see.",
+                f"{reach:.4g} units away, {why}; they are left out. They make {share:.2g} of what the training "
+                "cameras see.",
                 highlight=False,
             )
         rows[path] = np.flatnonzero(~beyond)
@@ -149,16 +149,22 @@ def _unwritten(frame: LocalFrame, count: int, request: ExportRequest, page: Init
 
 def rows_within_reach(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, " r"]:
     """Those that the format of a file can hold."""
-    far, reach = _distances(path, frame, means)
+    far, reach, _ = _distances(path, frame, means)
     return np.flatnonzero(far < reach)
 
 
-def _distances(path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, " m"], float]:
-    """The largest local coordinate of each, and how far the format of a file reaches."""
+def _distances(
+    path: Path, frame: LocalFrame, means: Float[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, " m"], float, str]:
+    """The largest local coordinate of each, how far a file of this format reaches, and why no farther."""
     kind, far = registry.format_from_path(path), np.abs(_local(frame, means)).max(1)
     if kind.reach_in_extents is not None and frame.facts.unit == UNKNOWN_UNIT:
-        return far, kind.reach_in_extents * float(np.quantile(far, 0.99))
-    return far, 0.999 * kind.max_coordinate
+        why = (
+            f"more than {kind.reach_in_extents:.0f} times as far as 99 of 100 Gaussians: with them, coordinates of all "
+            "would be coarser"
+        )
+        return far, kind.reach_in_extents * float(np.quantile(far, 0.99)), why
+    return far, 0.999 * kind.max_coordinate, "where the format does not reach"
 
 
 def _local(frame: LocalFrame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,7 @@ def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ())
     try:
         if not (_same_request(run, request, command) and _is_whole(run, request)):
             return ""
-        if any(not os.path.exists(file) for file in _read_files(run)):
+        if any(_gone_files(run)):
             return ""
         made = run.capture_file.stat().st_mtime_ns
         if any(time > made for time in (*_input_times(request, files), *_photograph_times(run))):
@@ -76,20 +77,30 @@ def _input_times(request: RunRequest, files: Sequence[Path]) -> Iterator[int]:
         yield from _times(path, request.output)
 
 
-def _read_files(run: RunFolder) -> Iterator[Path]:
-    """The photographs and masks that the run was made of: the files of its capture, and those that this was made of
-    here."""
+def _gone_files(run: RunFolder) -> Iterator[Path]:
+    """Of the photographs and masks that the run was made of, those that are gone: files of its capture, and those
+    around the run that this was made of here."""
     root = capture_root(Path(run.settings().capture_path))
     for view in read_json_or_empty(run.cameras_file).get("views", ()):
-        yield from (root / view[name] for name in ("file", "mask") if view.get(name))
+        yield from _gone([root / view[name] for name in ("file", "mask") if view.get(name)])
     if not run.own_capture.is_dir():
         return
     sources = SourceImages.read(run.own_capture)
-    used = None if sources is None else {digest for each in sources.files for digest in (each.digest, each.mask)}
+    used = None if sources is None else Counter(digest for each in sources.files for digest in (each.digest, each.mask))
+    alike = defaultdict[str, list[Path]](list)
     for file, digest in read_digests(run.own_capture).files().items():
-        # Digests are kept of files that were removed before the capture was made anew, too.
-        if _is_around(file.parent, run.path) and (used is None or digest in used):
-            yield file
+        if _is_around(file.parent, run.path):
+            alike[digest].append(file)
+    for digest, files in alike.items():
+        # Digests are kept of files that were renamed or removed before the capture was made anew, too: as many must be
+        # there as were used.
+        gone = _gone(files)
+        if len(files) - len(gone) < (1 if used is None else used[digest]):
+            yield from gone
+
+
+def _gone(files: Sequence[Path]) -> list[Path]:
+    return [file for file in files if not os.path.exists(file)]
 
 
 def _is_around(folder: str | Path, output: Path) -> bool:
@@ -113,7 +124,7 @@ def _times_in(folder: str | Path, names: Sequence[str], output: Path) -> Iterato
     """When these files of a folder changed last, and when one was added, removed or renamed.
 
     In a folder around the run, where runs and what is written beside them come and go, the times at which pictures came
-    there or were renamed tell that in place of the folder's own, and `_read_files` which are gone.
+    there or were renamed tell that in place of the folder's own, and `_gone_files` which are gone.
     """
     around = _is_around(folder, output)
     if not around:

@@ -25,10 +25,16 @@ def discard_training(output: Path, run: RunFolder | None) -> None:
     Workspace(output).forget(ANEW)
 
 
-def check_nothing_trained(request: SfmRequest, run: RunFolder | None, key: str = "") -> None:
+def forget_agreement(output: Path) -> None:
+    """Take back what `agree_to_discard` recorded: a capture that is there already was asked for meanwhile."""
+    if Workspace(output).has_begun(ANEW):
+        Workspace(output).forget(ANEW)
+
+
+def check_nothing_trained(request: SfmRequest, run: RunFolder | None, key: str | None = None) -> None:
     """Raise RunError where a capture is about to change that a run was trained on, unless work of this `key` was begun
-    with --overwrite."""
-    agreed = request.overwrite or Workspace(request.output).is_begun_by_any(ANEW, key)
+    with --overwrite. None: no work was begun."""
+    agreed = request.overwrite or (key is not None and Workspace(request.output).is_begun_by_any(ANEW, key))
     if run is not None and run.is_trained and not agreed:
         if SourceImages.read(run.own_capture) is None and run.config_file.exists():
             raise RunError(

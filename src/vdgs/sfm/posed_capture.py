@@ -36,7 +36,7 @@ from vdgs.geometry.similarity import rotation_to_z
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import capture_writer, feature_extraction, feature_matching, mask_files, pair_selection
-from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training
+from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training, forget_agreement
 from vdgs.sfm.feature_extraction import UNDECODABLE
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.posed_photographs import (
@@ -87,6 +87,7 @@ def make_posed_capture(
         console.print(f"{output}: made of these poses already; nothing to do", highlight=False)
         with suppress(VdgsError):  # it saves reading, and the folder may be read-only
             photographs.digests.write()
+            forget_agreement(output)
         return
     check_posed_output(photographs)
     check_nothing_trained(request, run, photographs.keys[CAPTURE])

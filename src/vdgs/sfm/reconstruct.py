@@ -16,7 +16,6 @@ from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.georeference import ENU_FRAME, LOCAL_FRAME, ORIGIN_KEYS
 from vdgs.captures.reconstruction import (
-    ANEW,
     MAPPED,
     RECONSTRUCTION_FIGURE,
     RECONSTRUCTION_FILE,
@@ -40,7 +39,7 @@ from vdgs.sfm import (
 )
 from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
 from vdgs.sfm.console_report import print_reconstruction_report
-from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training
+from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training, forget_agreement
 from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.image_list import ExcludedImage
@@ -104,8 +103,7 @@ def reconstruct(
             sources.write(output)
         with suppress(VdgsError):  # it saves reading, and the folder may be read-only
             digests.write()
-            if Workspace(output).has_begun(ANEW):  # others were asked for meanwhile
-                Workspace(output).forget(ANEW)
+            forget_agreement(output)
         if not request.keep_intermediate:
             work.remove()
         return before
