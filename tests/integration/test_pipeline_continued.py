@@ -92,7 +92,7 @@ def test_damaged_files_of_a_partition_are_named(copied):
 
 
 #: Of a change of the coarse stage's settings: they are written, the old model is deleted, it is gone.
-MOMENTS_OF_A_CHANGE = [("*/coarse/key", 2), ("*/coarse/model.safetensors", 1), ("*/coarse/.key.*", 1)]
+MOMENTS_OF_A_CHANGE = [("*/coarse/key", 3), ("*/coarse/model.safetensors", 1), ("*/coarse/.key.*", 1)]
 OTHER_SEED = (*SETTINGS, "--seed", "7")
 
 
