@@ -421,8 +421,8 @@ def train(
     iteration, iterations, loss, psnr in dB, anchors); one that returns True ends the stage early. With `run_dir` it is
     a run folder, which the same call continues after a crash; its blocks train in processes of their own, so it takes
     the capture's folder and no callbacks.
-    `capture_options` say how a folder is read, and go with no `Capture`. Raises CaptureError for a capture
-    that cannot become a scene, VdgsError for settings, TrainingDiverged.
+    `capture_options` say how a folder is read, and go with no `Capture`. Raises CaptureError for a capture that cannot
+    become a scene, VdgsError for settings, TrainingDiverged.
     """
     from vdgs.pipeline.train_in_memory import train_in_memory, train_in_run_folder
 
