@@ -122,7 +122,6 @@ def test_a_model_apart_from_its_photographs_is_named_with_what_joins_them(tmp_pa
     [
         "a/sfm_data.bin",
         "database.db",
-        "poses_bounds.npy",
         "place.psx",
         "place.rcproj",
         "scene.mvs",
@@ -162,7 +161,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("metadata.json", '{"h": 960, "perFrameIntrinsicCoeffs": [[0, 0, 0, 1]', "poses of Record3D"),
         ("cameras/17.json", '{"t_00": 1.0, "t_01": 0.0, "t_02": 0.0, "fx": 900}', "poses of Polycam"),
         ("trajectories.txt", "# kapture format: 1.1\n# timestamp, device_id, qw, qx, qy, qz, tx\n", "of Kapture"),
-        ("cams/00000000_cam.txt", "extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\nintrinsic\n", "of MVSNet"),
+        ("00000000_cam.txt", "extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\nintrinsic\n", "of MVSNet"),
         ("Barn.log", "0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 -2.5e-1\n0 0 0 1\n", "of Tanks and Temples"),
         ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n1.0, 000000, 0, 0", "Stray Scanner; the film"),
         ("cameras.json", '[{"id": 0, "img_name": "a", "position": [0, 0, 1], "fx": 900}]', "of a trained 3DGS scene"),

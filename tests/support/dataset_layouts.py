@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,37 @@ def write_mega_nerf(root: Path, scene: TinyScene, scale: float = 50.0) -> TinySc
         one = TinyScene({Path(name).name: camera}, scene.points, scene.colors)
         write_images(root / name.split("/")[0] / "rgbs", one)
     return TinyScene(renamed, scene.points, scene.colors)
+
+
+def write_mvsnet(root: Path, scene: TinyScene, cameras: str = "cams", depths: str = "425.0 2.5 192 933.8") -> TinyScene:
+    """As BlendedMVS: numbered cameras and photographs, with a masked copy of each.
+
+    Returns the views by the names that a capture gives them.
+    """
+    (root / cameras).mkdir(parents=True)
+    (root / cameras / "pair.txt").write_text(f"{len(scene.cameras)}\n0\n1 1 10.0 \n")
+    renamed = {f"{index:08d}.png": camera for index, camera in enumerate(scene.cameras.values())}
+    for name, camera in renamed.items():
+        pose = "".join(f"{' '.join(map(repr, row.tolist()))} \n" for row in camera.camera_from_world)
+        lens = f"{camera.fx} 0.0 {camera.cx} \n0.0 {camera.fy} {camera.cy} \n0.0 0.0 1.0 \n"
+        text = f"extrinsic\n{pose}\nintrinsic\n{lens}\n{depths}\n"
+        (root / cameras / name.replace(".png", "_cam.txt")).write_text(text)
+    images = root / "blended_images"
+    write_images(images, TinyScene(renamed, scene.points, scene.colors))
+    for name in renamed:
+        shutil.copyfile(images / name, images / name.replace(".", "_masked."))
+    return TinyScene(renamed, scene.points, scene.colors)
+
+
+def write_llff(root: Path, scene: TinyScene, images: str = "images") -> None:
+    """As imgs2poses.py, from COLMAP's cameras: columns right, down, forward become down, right, backwards."""
+    rows = []
+    for _, camera in sorted(scene.cameras.items()):
+        right, down, forward, place = np.linalg.inv(camera.camera_from_world)[:3].T
+        matrix = np.column_stack([down, right, -forward, place, [camera.height, camera.width, camera.fx]])
+        rows.append([*matrix.ravel(), 3.0, 20.0])
+    write_images(root / images, scene)
+    np.save(root / "poses_bounds.npy", np.array(rows))
 
 
 def matrixcity_frames(scene: TinyScene, block: str, unit: float) -> list[dict]:

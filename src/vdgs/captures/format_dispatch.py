@@ -20,8 +20,10 @@ from vdgs.captures.formats.colmap import (
     partial_model,
     read_colmap,
 )
+from vdgs.captures.formats.llff import is_llff, read_llff
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
+from vdgs.captures.formats.mvsnet import is_mvsnet, read_mvsnet
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import image_root
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_points
@@ -72,7 +74,8 @@ def read_source(root: Path, options: CaptureOptions, *, needs_points: bool = Tru
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}{others}Looked for a COLMAP model (sparse/0/cameras.bin and "
         "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF), transforms_train.json "
-        f"(MatrixCity) and projects of {', '.join(form.program for form in PROJECTS.values())}. Photographs alone "
+        "(MatrixCity), cams/*_cam.txt (MVSNet), poses_bounds.npy (LLFF) "
+        f"and projects of {', '.join(form.program for form in PROJECTS.values())}. Photographs alone "
         f"become one first: vdgs sfm {shell_word(root)} --output CAPTURE"
     )
 
@@ -235,4 +238,6 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path, CaptureOption
     "matrixcity": (pose_files, read_matrixcity),
     "colmap": (find_models, _read_colmap),
     "transforms": (lambda root: (root / TRANSFORMS_FILE).is_file(), read_transforms),
+    "mvsnet": (is_mvsnet, read_mvsnet),
+    "llff": (is_llff, read_llff),
 }

@@ -20,7 +20,7 @@ from vdgs.captures.formats.source_capture import (
 from vdgs.captures.image_files import find_images, is_turned, read_header, readable_suffixes, same_aspect
 from vdgs.captures.mask_matching import check_mask, find_masks
 from vdgs.captures.name_resolution import ImageNameIndex, find_in_other_folders, several_places
-from vdgs.captures.strays import masked_stem
+from vdgs.captures.strays import MASKED, masked_stem
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -74,7 +74,10 @@ def match_images(
 
 
 def _is_mask(path: Path, stems: set[Path]) -> bool:
-    """Whether an image is by its name the mask of one of those beside it, which are given without their suffixes."""
+    """Whether an image is by its name the mask of one of those beside it, which are given without their suffixes, or a
+    masked copy (BlendedMVS)."""
+    if path.stem.endswith(MASKED) and path.with_name(path.stem.removesuffix(MASKED)) in stems:
+        return True
     stem = masked_stem(path.stem) or (path.stem if Path(path.stem).suffix.lower() in readable_suffixes() else None)
     return stem is not None and bool({path.with_name(stem), path.with_name(Path(stem).stem)} & stems)
 

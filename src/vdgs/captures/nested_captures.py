@@ -10,8 +10,10 @@ from pathlib import Path, PurePath
 
 from vdgs.captures.capture_root import capture_root
 from vdgs.captures.formats.colmap import count_images, find_models
+from vdgs.captures.formats.llff import POSES_FILE, is_llff, read_llff
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
+from vdgs.captures.formats.mvsnet import CAMERA_END, is_mvsnet, read_mvsnet
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.image_files import readable_suffixes
 from vdgs.captures.output_guard import is_capture
@@ -69,7 +71,6 @@ _OTHERS = {
     "synth_0.out": "poses of MVE; the .nvm or bundle.out that its makescene was given is read",
     "*.ori": f"orientations of PATB; {_AS_OTHERS}",
     "itera.dat": f"orientations of BINGO; {_AS_OTHERS}",
-    "poses_bounds.npy": "poses of LLFF; the COLMAP model that they were made of is read",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
 #: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
@@ -98,7 +99,10 @@ _BY_CONTENT = (
         "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",
     ),
     (".txt", rb"\A# *kapture format", _KAPTURE),
-    (".txt", rb"\A\s*extrinsic\s", "cameras of MVSNet; the COLMAP model that they were made of is read"),
+    (
+        ".txt", rb"\A\s*extrinsic\s",
+        "a camera of MVSNet; the folder above is read, where these are cams/NAME_cam.txt in it, beside the photographs",
+    ),
     (
         ".log", rb"\A\s*\d+ +\d+ +\d+\s*\n(?:[-+.\de]+\s+){16}",
         "poses of Tanks and Temples without lenses; the COLMAP model that they were made of is read",
@@ -195,9 +199,10 @@ def _images_beside(root: Path, capture: Path) -> str:
 
 
 def _is_readable(capture: Path, options: CaptureOptions) -> bool:
-    """Whether the photographs of a set of JSON files are found."""
+    """Whether the photographs of a data set are found."""
+    readers = ((pose_files, read_matrixcity), (is_mvsnet, read_mvsnet), (is_llff, read_llff))
     try:
-        (read_matrixcity if pose_files(capture) else read_transforms)(capture, options, False)
+        next((reader for is_here, reader in readers if is_here(capture)), read_transforms)(capture, options, False)
     except CaptureError:
         return False
     return True
@@ -230,11 +235,13 @@ def check_no_foreign_file(path: Path) -> None:
 
 
 def _capture_of(file: Path) -> Path | None:
-    """The folder of a capture that a file of poses or points is a part of: of a set's transforms_train.json, or of a
-    COLMAP model; None for other files."""
+    """The folder of a capture that a file of poses or points is a part of: of a set's transforms_train.json or cameras,
+    or of a COLMAP model; None for other files."""
     folder = file.absolute().parent
     if file.name in _SET_FILES and pose_files(folder):
         return file.parent
+    if file.name == POSES_FILE or (file.name.endswith(CAMERA_END) and is_mvsnet(folder.parent)):
+        return file.parent if file.name == POSES_FILE else folder.parent
     if file.stem.lower() not in _MODEL_STEMS or folder not in find_models(folder):
         return None
     roots = [root for root in folder.parents[:3] if folder in find_models(root) and _has_photographs(root)]
@@ -268,9 +275,9 @@ def _folders(root: Path) -> Iterator[Path]:
 
 
 def _has_photographs(folder: Path) -> bool:
-    if (folder / "transforms.json").is_file() or is_mega_nerf(folder) or pose_files(folder):
+    if (folder / "transforms.json").is_file() or is_mega_nerf(folder) or pose_files(folder) or is_mvsnet(folder):
         return True
-    return any(entry.is_dir() and entry.name.startswith("images") for entry in folder.iterdir())
+    return is_llff(folder) or any(entry.is_dir() and entry.name.startswith("images") for entry in folder.iterdir())
 
 
 def _photographs_inside(folder: Path) -> Path | None:

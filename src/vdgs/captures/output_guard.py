@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vdgs.captures.formats.colmap import find_models
+from vdgs.captures.formats.llff import is_llff
 from vdgs.captures.formats.matrixcity import pose_files
 from vdgs.captures.formats.mega_nerf import is_mega_nerf
+from vdgs.captures.formats.mvsnet import is_mvsnet
 from vdgs.captures.image_files import has_camera
 from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from vdgs.captures.project_formats import is_project
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from vdgs.captures.capture import Capture
 
 #: What the folders of a capture that hold its inputs are usually called, in its root.
-_USUAL = re.compile(r"images(_\d+)?|masks|sparse|colmap", re.IGNORECASE)
+_USUAL = re.compile(r"(blended_)?images(_\d+)?|masks|sparse|colmap|cams(_\w+)?|cameras", re.IGNORECASE)
 #: What the stages of a run call their folders in it.
 _OF_STAGES = re.compile(r"coarse|visibility|partition|blocks|merged|lod|evaluation(_\w+)?")
 #: The same in the parts `train` and `val` of a capture in Mega-NeRF's layout.
@@ -205,6 +207,8 @@ def is_capture(root: Path) -> bool:
     """Whether a folder is a capture, of any format that is read: photographs whose cameras are known."""
     try:
         if (root / "transforms.json").is_file() or is_mega_nerf(root) or pose_files(root) or find_models(root):
+            return True
+        if is_mvsnet(root) or is_llff(root):
             return True
         return is_project(root)
     except OSError:

@@ -46,6 +46,8 @@ _MASK_STEM = re.compile(r"(?P<before>.+?)[ ._-](mask|msk)|(dynamic_)?(mask|msk)[
 _PREVIEW_STEM = re.compile(
     r"(?P<before>.+?)[ ._-](thumb|thumbnail|preview|small|proxy|tn)|(thumb|tn)[ ._-](?P<after>.+)", re.I
 )
+#: How BlendedMVS ends the names of copies that are black where the mesh shows nothing: no photographs, and no masks.
+MASKED = "_masked"
 
 
 def why_not_read(folder: Path) -> str | None:

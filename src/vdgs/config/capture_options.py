@@ -13,8 +13,8 @@ from vdgs.config.typed_paths import MaybeFolder
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every", "strips", "obliques"]
 CaptureFormat = Literal[
-    "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "metashape", "blocks-exchange", "opf", "pix4d",
-    "opensfm", "realityscan", "openmvg", "alicevision", "visualsfm", "bundler",
+    "auto", "colmap", "transforms", "mega-nerf", "matrixcity", "mvsnet", "llff", "metashape", "blocks-exchange", "opf",
+    "pix4d", "opensfm", "realityscan", "openmvg", "alicevision", "visualsfm", "bundler",
 ]  # fmt: skip
 
 

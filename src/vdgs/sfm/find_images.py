@@ -20,7 +20,7 @@ from vdgs.captures.image_suffixes import (
 )
 from vdgs.captures.name_resolution import to_colmap_name, to_nfc
 from vdgs.captures.optional_decoders import INSTALL
-from vdgs.captures.strays import is_result, previewed_stem, walk
+from vdgs.captures.strays import MASKED, is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import check_is_text
 from vdgs.system.units import first_names
@@ -147,6 +147,8 @@ def _add(found: Found, path: Path, written: str, stems: set[str]) -> None:
     preview = previewed_stem(path.stem)
     if preview is not None and preview.lower() in stems:
         found.left_out[name] = "is a preview, by its name"
+    elif path.stem.endswith(MASKED) and path.stem.removesuffix(MASKED).lower() in stems:
+        found.left_out[name] = "is a masked copy, by its name"
     elif is_result(path):
         found.left_out[name] = "is a map or another result, by its name"
     elif name in found.named:

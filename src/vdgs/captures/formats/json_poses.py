@@ -150,7 +150,7 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     width, height = get("w"), get("h")
     if width is None or height is None:
         header = read_header(image)
-        width, height = _told_size((header.width, header.height), (get("cx"), get("cy")), file, image.name)
+        width, height = told_size((header.width, header.height), (get("cx"), get("cy")), file, image.name, _WRITE_SIZE)
     fx = get("fl_x", _focal(width, get("camera_angle_x")))
     fy = get("fl_y", fx if get("fl_x") is not None else _focal(height, get("camera_angle_y")))
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
@@ -168,8 +168,8 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
 
 
-def _told_size(
-    size: tuple[int, int], center: tuple[float | None, float | None], file: Path, label: str
+def told_size(
+    size: tuple[int, int], center: tuple[float | None, float | None], file: Path, label: str, remedy: str
 ) -> tuple[int, int]:
     """The size that a lens without one is told for, by the photograph's and the principal point. Raises `CaptureError`
     where that is in the middle of no size that has the shape of the photograph."""
@@ -183,10 +183,11 @@ def _told_size(
                 return round(size[0] * many), round(size[1] * many)
         if same_aspect((round(2 * cx), round(2 * cy)), size):
             return round(2 * cx), round(2 * cy)
-    check_centered((cx, cy), size, file, label, "Write w and h into the file, or give the photographs of that size.")
+    check_centered((cx, cy), size, file, label, remedy)
     return size
 
 
+_WRITE_SIZE = "Write w and h into the file, or give the photographs of that size."
 #: By whole numbers photographs are shrunk, or the file is; principal points are so near the middle, as a share of it.
 _SHRUNK, _MIDDLE = (*range(2, 17), *(1 / many for many in range(2, 17))), 0.01
 #: Ways to say a focal length, one of which is enough.
