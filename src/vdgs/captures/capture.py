@@ -51,7 +51,7 @@ class Capture:
     """A folder of photographs with cameras and sparse points, checked, in the ground frame."""
 
     root: Path
-    #: The format it was read from ("colmap", "transforms", "mega-nerf", "matrixcity").
+    #: The format it was read from ("colmap", "transforms", "mega-nerf", "matrixcity", "mvsnet", "llff").
     source: str
     #: The image folder in use, relative to root ("images_4").
     images: str

@@ -187,7 +187,7 @@ def open_run(
 
 
 def load_capture(path: str | Path, **options: Any) -> Capture:
-    """Read and check a capture: a folder with COLMAP, nerfstudio, Mega-NeRF or MatrixCity files.
+    """Read and check a capture: a folder with files of COLMAP, nerfstudio, Mega-NeRF, MatrixCity, MVSNet or LLFF.
 
     `options` are those of `CaptureOptions`, as in `vdgs run --help`: images="images_4", downscale=2, test_every=8, ...
     Raises CaptureError naming the file, the fault and the remedy, VdgsError for an option that does not work.

@@ -81,7 +81,7 @@ def _load(file: Path) -> np.ndarray:
     except PermissionError as error:
         raise CaptureError(f"{file}: {refusal(file, error)}") from None
     except Exception as error:  # its parser raises many kinds on damaged headers
-        if "allow_pickle" in str(error) or "Object arrays" in str(error):  # without numpy's advice to let it run
+        if "Python objects" in str(error):  # as numpy says of files that it could only unpickle
             raise CaptureError(
                 f"{file}: holds objects of Python, not numbers, and these are not read. Save it anew as an array of "
                 "numbers (float64)."

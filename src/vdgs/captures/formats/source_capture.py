@@ -1,6 +1,6 @@
 """What a reader hands over: cameras and points as the files have them, before any choice of ours.
 
-Every reader (COLMAP, transforms.json, Mega-NeRF, MatrixCity) yields a `SourceCapture` in its own world,
+Every reader (COLMAP, transforms.json, Mega-NeRF, MatrixCity, MVSNet, LLFF) yields a `SourceCapture` in its own world,
 already in OpenCV camera axes. `loading` turns it into a checked `Capture` in the ground frame.
 """
 
