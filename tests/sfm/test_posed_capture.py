@@ -17,7 +17,7 @@ from rich.console import Console
 
 from support import flights, project_writers
 from support.captures import TinyScene, write_colmap
-from support.dataset_layouts import OPENGL
+from support.dataset_layouts import OPENGL, write_llff, write_mvsnet
 from support.flights import ALTITUDE_M, FOCAL, HEIGHT, WIDTH
 from support.known_flight import BentLens, KnownFlight, centers_of, ecef
 from vdgs.captures.format_dispatch import lacks_points
@@ -203,6 +203,26 @@ def test_captures_without_points_get_them_with_their_poses_and_lists(
     assert len(capture.points) > 100
     if not is_model:
         assert [Path(view.name).stem for view in capture.test_views] == [Path(names[1]).stem]
+
+
+@pytest.mark.parametrize("kind", ["mvsnet", "llff"])
+def test_points_of_cameras_without_names_or_sizes_fit_the_poses(
+    town_flight: tuple[Path, KnownFlight], tmp_path: Path, kind: str
+) -> None:
+    root, flight = town_flight
+    cameras = dict(zip(flight.names[:4], flights.grid(2, 4, 9.0)[:4], strict=True))
+    scene = TinyScene(cameras, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    (write_mvsnet if kind == "mvsnet" else write_llff)(tmp_path, scene)
+    folder = tmp_path / ("blended_images" if kind == "mvsnet" else "images")
+    for k, (name, plane) in enumerate(zip(cameras, sorted(folder.glob("*[0-9].*")), strict=True)):
+        plane.unlink()
+        shutil.copyfile(root / "straight" / name, folder / (f"{k:08d}.jpg" if kind == "mvsnet" else name))
+    told = ask(tmp_path, tmp_path / "capture")
+    assert float(told.partition("mean reprojection error ")[2].split()[0]) < 0.7
+    capture = load_capture(tmp_path / "capture", CaptureOptions(up="z"))
+    centers = _from_ground(capture.ground)(np.stack([view.camera.position for view in capture.views]))
+    assert np.abs(centers - centers_of(flight.poses[:4])).max() < 1e-6
+    assert len(capture.points) > 100
 
 
 def _some_photographs(town_flight: tuple[Path, KnownFlight], tmp_path: Path) -> tuple[Path, KnownFlight]:

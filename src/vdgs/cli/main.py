@@ -44,8 +44,8 @@ more:
   bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables and a verdict; needs a checkout
 
 vdgs VERB --help shows the options that people set, --help-all every one. A capture is a folder with images/ and
-sparse/0 (COLMAP), transforms.json (nerfstudio), train/ and val/ (Mega-NeRF), the layout of MatrixCity, cams/ (MVSNet) or
-poses_bounds.npy (LLFF); `sfm` makes one of photographs.
+sparse/0 (COLMAP), transforms.json (nerfstudio), train/ and val/ (Mega-NeRF), the layout of MatrixCity, cams/
+(MVSNet) or poses_bounds.npy (LLFF); `sfm` makes one of photographs.
 """
 
 #: The verbs, which begin the lines of the help.
