@@ -23,7 +23,7 @@ from vdgs.export.formats.gaussian_ply import draws_antialiased, header_comments,
 from vdgs.export.formats.gaussian_store import write_store
 from vdgs.export.formats.ply_header import PlyHeader, read_ply_header
 from vdgs.kernels import get_backend
-from vdgs.kernels.spherical_harmonics import num_sh_bases, rgb_to_sh
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases, rgb_to_sh
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.scratch import scratch_folder
@@ -36,9 +36,11 @@ BOUNDS = tuple(
     for end in ("min", "max")
     for what in names
 )
-#: Those that every file has.
+#: Those that every file has; older ones have none of colors.
 EDGES = BOUNDS[:12]
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+#: Coefficients of changing colors in all three channels, by their degree.
+HARMONICS = tuple(3 * (num_sh_bases(degree) - 1) for degree in range(MAX_SH_DEGREE + 1))
 #: Readers take no larger or smaller logarithm of a size.
 LARGEST_LOG = 20.0
 #: Coefficients of spherical harmonics lie between minus and plus half of this.
@@ -155,8 +157,7 @@ def compressed_ply_pieces(path: Path) -> Iterator[Gaussians]:
     damaged one."""
     header = read_ply_header(path)
     chunks, vertices = _rows_of(header, "chunk", EDGES), _rows_of(header, "vertex", PACKED)
-    sh = header.find("sh")
-    coefficients = tuple(f"f_rest_{i}" for i in range(len(sh[0].layout.names or ()) if sh is not None else 0))
+    coefficients = _coefficients(header)
     harmonics = _rows_of(header, "sh", coefficients) if coefficients else None
     count = len(vertices)
     if count < 1 or len(chunks) != -(-count // CHUNK) or (harmonics is not None and len(harmonics) != count):
@@ -175,6 +176,17 @@ def compressed_ply_pieces(path: Path) -> Iterator[Gaussians]:
         if harmonics is not None:
             coded = np.stack([harmonics[name][rows] for name in coefficients], 1)
         yield axes.to_ground(_unpacked(bounds[chunk], words, coded.reshape(len(words), 3, -1)))
+
+
+def _coefficients(header: PlyHeader) -> tuple[str, ...]:
+    """Names of the coefficients of changing colors, a byte each. Raises VdgsError for a number of no degree."""
+    found = header.find("sh")
+    kinds = [kind[0] for kind in (found[0].layout.fields or {}).values()] if found is not None else []
+    if any(kind != np.uint8 for kind in kinds) or len(kinds) not in HARMONICS:
+        raise VdgsError(
+            f"{header.path}: its element 'sh' has {len(kinds)} properties, not {HARMONICS[1:]} bytes. Write it again."
+        )
+    return tuple(f"f_rest_{i}" for i in range(len(kinds)))
 
 
 def _rows_of(header: PlyHeader, name: str, needs: Sequence[str]) -> np.ndarray:

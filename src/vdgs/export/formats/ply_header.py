@@ -64,7 +64,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     end = data.find(b"\nend_header")
     start = data.find(b"\n", end + 1) + 1
     if not data.startswith(b"ply") or end < 0 or not start:
-        raise VdgsError(f"{path}: is no PLY file, or its header is damaged. Write it again.")
+        raise VdgsError(f"{path}: is no PLY file, or its header is truncated. Write it again.")
     lines = data[:end].decode("latin-1").splitlines()
     form = next((words[1] for words in map(str.split, lines) if words[:1] == ["format"] and len(words) > 1), "")
     if form not in BYTE_ORDERS:
