@@ -140,6 +140,13 @@ def test_colors_that_do_not_change_stay_as_bright_as_they_are(tmp_path):
     assert float(read.reshape(len(read), -1).mean(1).abs().max()) < 1 / 64 / 45 + 1e-6
 
 
+def test_changing_colors_of_no_degree_are_refused(tmp_path):
+    registry.write_scene(tmp_path / "a.compressed.ply", ExportScene.of(random_gaussians(5, 1)))
+    replace_bytes(tmp_path / "a.compressed.ply", b"property uchar f_rest_8\n", b"")
+    with pytest.raises(VdgsError, match="'sh' has 8 properties, not \\(9, 24, 45\\) bytes"):
+        registry.read_gaussians(tmp_path / "a.compressed.ply")
+
+
 # Headers and rows
 
 
