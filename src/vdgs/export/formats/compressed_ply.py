@@ -7,8 +7,7 @@ coefficients of spherical harmonics are bytes between -4 and 4. The frame is tha
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -19,10 +18,12 @@ from jaxtyping import Float, UInt32
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Y_DOWN, Axes, axes_named
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, base_colors, logits_from_opacity, opacities
-from vdgs.export.formats.gaussian_ply import MAX_HEADER_BYTES, header_comments, write_crs_beside
+from vdgs.export.formats.foreign_gaussians import warn_antialiased
+from vdgs.export.formats.gaussian_ply import draws_antialiased, header_comments, write_crs_beside
 from vdgs.export.formats.gaussian_store import write_store
+from vdgs.export.formats.ply_header import PlyHeader, read_ply_header
 from vdgs.kernels import get_backend
-from vdgs.kernels.spherical_harmonics import num_sh_bases, rgb_to_sh
+from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases, rgb_to_sh
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.scratch import scratch_folder
@@ -35,7 +36,11 @@ BOUNDS = tuple(
     for end in ("min", "max")
     for what in names
 )
+#: Those that every file has; older ones have none of colors.
+EDGES = BOUNDS[:12]
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+#: Coefficients of changing colors in all three channels, by their degree.
+HARMONICS = tuple(3 * (num_sh_bases(degree) - 1) for degree in range(MAX_SH_DEGREE + 1))
 #: Readers take no larger or smaller logarithm of a size.
 LARGEST_LOG = 20.0
 #: Coefficients of spherical harmonics lie between minus and plus half of this.
@@ -75,7 +80,7 @@ def write_compressed_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
 
 def _header(scene: ExportScene, axes: Axes, coefficients: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene.metadata, axes)]
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(scene, axes)]
     lines += [f"element chunk {-(-scene.count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
     lines += [f"element vertex {scene.count}", *(f"property uint {name}" for name in PACKED)]
     if coefficients:
@@ -131,44 +136,77 @@ def _rotation(quaternions: Float[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]
 
 
 def _bytes_of_harmonics(piece: Gaussians) -> np.ndarray:
-    """Channel by channel, as in a plain PLY; a byte stands for the middle of what it covers."""
-    coded = np.floor((piece.shN.numpy().transpose(0, 2, 1) / SPAN + 0.5) * 256)
+    """Channel by channel, as in a plain PLY; a byte stands for the middle of what it covers.
+
+    Zero, as what does not change with the direction has it, lies between two bytes. Such values go up and down in
+    turn, from coefficient to coefficient and Gaussian to Gaussian: all of them up would make the scene brighter."""
+    places = (piece.shN.numpy().transpose(0, 2, 1) / SPAN + 0.5) * 256
+    coded = np.floor(places)
+    rows, channels, bands = np.ogrid[tuple(map(slice, places.shape))]
+    coded -= (coded == places) & ((rows + channels + bands) % 2 == 1)
     return np.clip(coded, 0, 255).astype(np.uint8)
 
 
-def is_compressed(head: bytes) -> bool:
+def is_compressed(header: PlyHeader) -> bool:
     """Whether a header is one of these."""
-    return re.search(rb"^property \w+ packed_position\s*$", head, re.MULTILINE) is not None
+    return any(set(PACKED) <= set(element.layout.names or ()) for element in header.elements)
 
 
 def compressed_ply_pieces(path: Path) -> Iterator[Gaussians]:
     """The Gaussians of a file, in the ground frame, at most `CHUNK_SIZE` at a time. Raises VdgsError for another or a
     damaged one."""
-    try:
-        data = np.memmap(path, np.uint8, "r")
-    except (OSError, ValueError) as error:
-        raise VdgsError(f"{path}: cannot be read ({error}).") from error
-    head, end, _ = bytes(data[:MAX_HEADER_BYTES]).partition(b"end_header\n")
-    if not end or not is_compressed(head):
-        raise VdgsError(f"{path}: is no compressed PLY of PlayCanvas.")
-    text = head.decode("latin-1")
-    counts = {name: int(number) for name, number in re.findall(r"^element (\w+) (\d+)\s*$", text, re.MULTILINE)}
-    coefficients = len(re.findall(r"^property uchar f_rest_", text, re.MULTILINE))
-    described = re.search(r"^comment axes (.*)$", text, re.MULTILINE)
-    axes = axes_named(described[1].strip() if described else None, Y_DOWN)
-    chunks, count = counts.get("chunk", 0), counts.get("vertex", 0)
-    sizes = (chunks * 4 * len(BOUNDS), count * 4 * len(PACKED), count * coefficients)
-    start = len(head) + len(end)
-    if count < 1 or chunks != -(-count // CHUNK) or len(data) < start + sum(sizes):
-        raise VdgsError(f"{path}: holds fewer Gaussians than it announces. It is truncated; write it again.")
-    edges = np.cumsum([start, *sizes])
-    bounds = data[edges[0] : edges[1]].view("<f4").reshape(chunks, 6, 3)
-    words = data[edges[1] : edges[2]].view("<u4").reshape(count, 4)
-    harmonics = data[edges[2] : edges[3]].reshape(count, 3, coefficients // 3)
+    header = read_ply_header(path)
+    chunks, vertices = _rows_of(header, "chunk", EDGES), _rows_of(header, "vertex", PACKED)
+    coefficients = _coefficients(header)
+    harmonics = _rows_of(header, "sh", coefficients) if coefficients else None
+    count = len(vertices)
+    if count < 1 or len(chunks) != -(-count // CHUNK) or (harmonics is not None and len(harmonics) != count):
+        raise VdgsError(
+            f"{path}: its {len(chunks)} chunks are not those of {count} Gaussians. It is damaged; write it again."
+        )
+    if draws_antialiased(header):
+        warn_antialiased(path)
+    axes = axes_named(header.comment("axes "), Y_DOWN)
+    bounds = _bounds(chunks)
     for first in range(0, count, CHUNK_SIZE):
         rows = slice(first, first + CHUNK_SIZE)
         chunk = np.arange(first, min(first + CHUNK_SIZE, count)) // CHUNK
-        yield axes.to_ground(_unpacked(bounds[chunk], np.array(words[rows]), np.array(harmonics[rows])))
+        words = np.stack([vertices[name][rows] for name in PACKED], 1).astype(np.uint32)
+        coded = np.zeros((len(words), 0), np.uint8)
+        if harmonics is not None:
+            coded = np.stack([harmonics[name][rows] for name in coefficients], 1)
+        yield axes.to_ground(_unpacked(bounds[chunk], words, coded.reshape(len(words), 3, -1)))
+
+
+def _coefficients(header: PlyHeader) -> tuple[str, ...]:
+    """Names of the coefficients of changing colors, a byte each. Raises VdgsError for a number of no degree."""
+    found = header.find("sh")
+    kinds = [kind[0] for kind in (found[0].layout.fields or {}).values()] if found is not None else []
+    if any(kind != np.uint8 for kind in kinds) or len(kinds) not in HARMONICS:
+        raise VdgsError(
+            f"{header.path}: its element 'sh' has {len(kinds)} properties, not {HARMONICS[1:]} bytes. Write it again."
+        )
+    return tuple(f"f_rest_{i}" for i in range(len(kinds)))
+
+
+def _rows_of(header: PlyHeader, name: str, needs: Sequence[str]) -> np.ndarray:
+    """The rows of an element, left on the disk. Raises VdgsError where it is not there, or not all of it."""
+    path, found = header.path, header.find(name)
+    missing = [each for each in needs if found is None or each not in (found[0].layout.names or ())]
+    if found is None or missing or header.form == "ascii":
+        what = f"{name} has no {missing[0]}" if missing else "it is text"
+        raise VdgsError(f"{path}: is no compressed PLY of PlayCanvas ({what}). Write it again, or as a plain PLY.")
+    element, start = found
+    if path.stat().st_size < start + element.count * element.layout.itemsize:
+        raise VdgsError(f"{path}: holds fewer Gaussians than it announces. It is truncated; write it again.")
+    return np.memmap(path, element.layout, "r", start, element.count) if element.count else np.empty(0, element.layout)
+
+
+def _bounds(chunks: np.ndarray) -> Float[np.ndarray, "c 6 3"]:
+    """What `BOUNDS` names. Older files have none of the colors, which are then between 0 and 1."""
+    held = chunks.dtype.names or ()
+    columns = [chunks[name] if name in held else np.full(len(chunks), float(name.startswith("max"))) for name in BOUNDS]
+    return np.stack(columns, 1).astype(np.float32).reshape(len(chunks), 6, 3)
 
 
 def _unpacked(bounds: np.ndarray, words: np.ndarray, harmonics: np.ndarray) -> Gaussians:

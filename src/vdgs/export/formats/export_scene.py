@@ -81,6 +81,8 @@ class ExportScene:
     axes: Axes | None = None
     #: Version of an SPZ.
     spz_version: int = 3
+    #: Whether the Gaussians are meant to be drawn anti-aliased, as some programs train them: a PLY and an SPZ say so.
+    antialiased: bool = False
 
     @staticmethod
     def of(gaussians: Gaussians, metadata: ExportMetadata | None = None) -> ExportScene:

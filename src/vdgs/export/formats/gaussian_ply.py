@@ -12,21 +12,22 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
 
-from vdgs.captures.formats.ply_reader import BYTE_ORDERS, PLY_DTYPES
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Z_UP, Axes, axes_named
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportMetadata, ExportScene
+from vdgs.export.formats.foreign_gaussians import fused_filter, warn_antialiased
+from vdgs.export.formats.ply_header import PlyElement, PlyHeader, read_ply_header
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
 from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic, write_text, write_values
 from vdgs.system.quoting import header_line
 
-MAX_HEADER_BYTES = 1 << 16
+#: What Brush says of Gaussians that are to be drawn anti-aliased.
+MIP_COMMENT = "SplatRenderMode: mip"
 #: Characters of a fact in a comment.
 LONGEST_COMMENT = 200
 SCALE_NAMES = tuple(f"scale_{axis}" for axis in range(3))
@@ -40,13 +41,14 @@ def property_names(degree: int) -> tuple[str, ...]:
     return ("x", "y", "z", "nx", "ny", "nz", *DC_NAMES, *rest, "opacity", *SCALE_NAMES, *ROTATION_NAMES)
 
 
-def header_comments(metadata: ExportMetadata, axes: Axes) -> list[str]:
+def header_comments(scene: ExportScene, axes: Axes) -> list[str]:
     """Header lines that say where local coordinates stand, one fact each, as JSON, none of them long."""
-    known = {**metadata.to_dict(), "axes": axes.description}
-    if metadata.crs is not None:
-        known["crs"] = short_name(metadata.crs)
-    return [f"comment {name} {header_line(value if isinstance(value, str) else json.dumps(value))[:LONGEST_COMMENT]}"
-            for name, value in known.items()]  # fmt: skip
+    known = {**scene.metadata.to_dict(), "axes": axes.description}
+    if scene.metadata.crs is not None:
+        known["crs"] = short_name(scene.metadata.crs)
+    lines = [f"comment {name} {header_line(value if isinstance(value, str) else json.dumps(value))[:LONGEST_COMMENT]}"
+             for name, value in known.items()]  # fmt: skip
+    return [*lines, f"comment {MIP_COMMENT}"] if scene.antialiased else lines
 
 
 def short_name(crs: str) -> str:
@@ -99,7 +101,7 @@ def write_vertices(
     """A PLY of one row for each Gaussian, and its coordinate system beside it."""
     axes = scene.axes or Z_UP
     lines = [
-        "ply", "format binary_little_endian 1.0", *header_comments(scene.metadata, axes),
+        "ply", "format binary_little_endian 1.0", *header_comments(scene, axes),
         f"element vertex {scene.count}", *(f"property {each}" for each in properties), "end_header", "",
     ]  # fmt: skip
 
@@ -130,33 +132,64 @@ def read_ply_chunks(path: Path) -> Iterator[Gaussians]:
 
     Raises VdgsError for a file that is missing, of another kind, or shorter than it announces.
     """
-    form, layout, count, start, axes = _header(path)
-    names = layout.names or ()
+    header = read_ply_header(path)
+    found = header.find("vertex")
+    if found is None:
+        raise VdgsError(f"{path}: has no element 'vertex'; this is no PLY of 3DGS. Write it as one.")
+    vertices, start = found
+    names = set(vertices.layout.names or ())
     rest = sum(name.startswith("f_rest_") for name in names)
+    _check_names(path, names, rest)
+    held = (path.stat().st_size - start) // max(vertices.layout.itemsize, 1)
+    if header.form != "ascii" and held < vertices.count:
+        raise VdgsError(
+            f"{path}: announces {vertices.count} Gaussians but holds {held}. It is truncated; write it again."
+        )
+    if draws_antialiased(header) or "filter_3D" in names:
+        warn_antialiased(path)
+    axes = axes_named(header.comment("axes "), Z_UP)
+    for table in _tables(header, vertices, start):
+        yield axes.to_ground(_gaussians(table, rest))
+
+
+def draws_antialiased(header: PlyHeader) -> bool:
+    """Whether a comment says so, in the words of Brush or Postshot."""
+    return header.comment(MIP_COMMENT.partition(":")[0] + ":") == "mip" or header.comment("antialiased ") == "1"
+
+
+def _check_names(path: Path, names: set[str], rest: int) -> None:
+    """Raise VdgsError where properties are missing that a PLY of 3DGS has."""
     missing = [name for name in property_names(0) if name not in names and not name.startswith("n")]
     if missing or rest not in {3 * (num_sh_bases(degree) - 1) for degree in range(MAX_SH_DEGREE + 1)}:
         what = f"has no {missing[0]}" if missing else f"has {rest} f_rest properties"
         raise VdgsError(f"{path}: {what}; this is no PLY of 3DGS. Point clouds have other layouts.")
-    held = (path.stat().st_size - start) // layout.itemsize
-    if form != "ascii" and held < count:
-        raise VdgsError(f"{path}: announces {count} Gaussians but holds {held}. It is truncated; write it again.")
+    gaps = [name for name in (f"f_rest_{index}" for index in range(rest)) if name not in names]
+    if gaps:
+        raise VdgsError(
+            f"{path}: has {rest} f_rest properties, but none of the name {gaps[0]}. Number them without gaps, from 0."
+        )
+
+
+def _tables(header: PlyHeader, vertices: PlyElement, start: int) -> Iterator[np.ndarray]:
+    """The rows of vertices, at most `CHUNK_SIZE` at a time. Raises VdgsError where there are fewer."""
+    path, layout = header.path, vertices.layout
     try:
         with path.open("rb") as file:
-            file.seek(start)
-            for first in range(0, max(count, 1), CHUNK_SIZE):
-                yield axes.to_ground(_gaussians(_table(file, form, layout, min(CHUNK_SIZE, count - first)), rest))
+            file.seek(header.start if header.form == "ascii" else start)
+            lines = (line for line in file if line.strip()) if header.form == "ascii" else None
+            if lines is not None:
+                next(islice(lines, start, start), None)  # of other elements
+            for first in range(0, max(vertices.count, 1), CHUNK_SIZE):
+                count = min(CHUNK_SIZE, vertices.count - first)
+                if lines is None:
+                    yield np.frombuffer(file.read(count * layout.itemsize), layout)
+                else:
+                    rows = [tuple(line.split()) for line in islice(lines, count)]
+                    yield np.array(rows, [(name, "f4") for name in layout.names or ()]).reshape(count)
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except ValueError as error:
         raise VdgsError(f"{path}: is damaged or truncated ({error}). Write it again.") from error
-
-
-def _table(file: BinaryIO, form: str, layout: np.dtype, count: int) -> np.ndarray:
-    """The next so many vertices. Raises ValueError where there are fewer."""
-    if form != "ascii" or not count:
-        return np.frombuffer(file.read(count * layout.itemsize), layout)
-    rows = [tuple(line.split()) for line in islice(file, count)]
-    return np.array(rows, [(name, "f4") for name in layout.names or ()]).reshape(count)
 
 
 def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
@@ -167,38 +200,9 @@ def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
     coefficients = (
         columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0, dtype=torch.float32, device="cpu")
     )
-    return Gaussians(
+    found = Gaussians(
         means=columns("x", "y", "z"), log_scales=columns(*SCALE_NAMES), quaternions=columns(*ROTATION_NAMES),
         opacity_logits=columns("opacity")[:, 0], sh0=columns(*DC_NAMES),
         shN=coefficients.reshape(n, 3, rest // 3).transpose(1, 2).contiguous(),
     )  # fmt: skip
-
-
-def _header(path: Path) -> tuple[str, np.dtype, int, int, Axes]:
-    """The file's format, layout of a vertex, their number, where they begin, and the axes that a comment names."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_HEADER_BYTES)
-    except OSError as error:
-        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    end = data.find(b"\nend_header")
-    start = data.find(b"\n", end + 1) + 1
-    if not data.startswith(b"ply") or end < 0 or not start:
-        raise VdgsError(f"{path}: is no PLY file.")
-    fields: list[tuple[str, str]] = []
-    form, count, elements, axes = "", -1, 0, Z_UP
-    for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):
-        if words[:1] == ["format"] and len(words) > 1:
-            form = words[1]
-        elif words[:2] == ["comment", "axes"]:
-            axes = axes_named(" ".join(words[2:]), Z_UP)
-        elif words[:1] == ["element"] and len(words) == 3:
-            elements += 1
-            count = int(words[2]) if elements == 1 and words[1] == "vertex" and words[2].isdecimal() else count
-        elif words[:1] == ["property"] and elements == 1:
-            if len(words) != 3 or words[1] not in PLY_DTYPES:
-                raise VdgsError(f"{path}: has a property that is not understood ({' '.join(words)}).")
-            fields.append((words[2], PLY_DTYPES[words[1]]))
-    if form not in BYTE_ORDERS or count < 0:
-        raise VdgsError(f"{path}: is no PLY of vertices (format {form!r}). Write it as binary_little_endian.")
-    return form, np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields]), count, start, axes
+    return fused_filter(found, columns("filter_3D")[:, 0]) if "filter_3D" in (table.dtype.names or ()) else found

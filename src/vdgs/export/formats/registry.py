@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.compressed_ply import compressed_ply_pieces, write_compressed_ply
+from vdgs.export.formats.compressed_ply import compressed_ply_pieces, is_compressed, write_compressed_ply
 from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate, metadata_path
 from vdgs.export.formats.file_folders import FileFolder
+from vdgs.export.formats.foreign_gaussians import finite_pieces
 from vdgs.export.formats.gaussian_ply import beside_ply, read_ply_chunks, reads_as_written_beside, write_ply
 from vdgs.export.formats.gltf import check_glb_size, write_glb
 from vdgs.export.formats.html import check_page, html_capacity, read_html_chunks, write_html
+from vdgs.export.formats.ply_header import read_ply_header
 from vdgs.export.formats.point_cloud import (
     LAS_REACH_IN_EXTENTS,
     MAX_LAS_COORDINATE,
@@ -82,6 +84,11 @@ class ExportFormat:
         return self.folder.remove_killed(path) if self.folder else remove_leftovers(path)
 
 
+def read_any_ply(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a PLY by what its header says: compressed ones have names of plain ones elsewhere."""
+    return (compressed_ply_pieces if is_compressed(read_ply_header(path)) else read_ply_chunks)(path)
+
+
 #: The longer endings first: `.points.ply` and `.compressed.ply` are `.ply` too.
 FORMATS: tuple[ExportFormat, ...] = (
     ExportFormat(
@@ -95,14 +102,14 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".compressed.ply",
         description="PlayCanvas' compressed PLY, a quarter",
         write=write_compressed_ply,
-        read=compressed_ply_pieces,
+        read=read_any_ply,
         facts_file=beside_ply,
     ),
     ExportFormat(
         suffix=".ply",
         description="3DGS PLY, nothing lost",
         write=write_ply,
-        read=read_ply_chunks,
+        read=read_any_ply,
         facts_file=beside_ply,
     ),
     ExportFormat(
@@ -277,4 +284,4 @@ def read_chunks(path: Path) -> Iterator[Gaussians]:
     if chosen.read is None:
         able = ", ".join(each.suffix for each in FORMATS if each.read)
         raise VdgsError(f"{path}: such files are written but not read. Readable are: {able}.")
-    return chosen.read(path)
+    return finite_pieces(path, chosen.read(path))

@@ -29,6 +29,7 @@ from vdgs.export.formats.export_scene import (
     to_uint8,
     write_metadata_file,
 )
+from vdgs.export.formats.foreign_gaussians import warn_antialiased
 from vdgs.export.formats.parallel_gzip import gzip_blocks
 from vdgs.export.formats.quaternion_canonical import canonicalize_quaternions
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, num_sh_bases
@@ -42,6 +43,8 @@ HEADER_STRUCT = struct.Struct("<IIIBBBB")
 HEADER_4, SIZES = struct.Struct("<IIIBBBBI12x"), struct.Struct("<QQ")
 #: What is quantised deflates hardly better at higher levels of zstd (1 .. 22).
 ZSTD_LEVEL = 9
+#: Flags of the header: how the Gaussians are to be drawn, and that something follows them.
+ANTIALIASED, HAS_EXTENSIONS = 1, 2
 FRACTION_BITS = 12
 #: Positions lie below this many units from the origin.
 MAX_COORDINATE = 2**23 / 2**FRACTION_BITS
@@ -91,7 +94,8 @@ def write_spz(path: Path, scene: ExportScene) -> tuple[str, ...]:
                     if version == 4:
                         _write_streams(file, scene, spools)
                         return
-                    for part in gzip_blocks(_stream(encode_header(scene.count, scene.degree, version), spools)):
+                    head = encode_header(scene.count, scene.degree, version, flags=_flags(scene))
+                    for part in gzip_blocks(_stream(head, spools)):
                         file.write(part)
             finally:
                 for spool in spools.values():
@@ -108,9 +112,13 @@ def write_spz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def encode_header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
+def encode_header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS, flags: int = 0) -> bytes:
     """The head of a file whose positions have `fraction` bits after the point."""
-    return HEADER_STRUCT.pack(MAGIC, version, count, degree, fraction, 0, 0)
+    return HEADER_STRUCT.pack(MAGIC, version, count, degree, fraction, flags, 0)
+
+
+def _flags(scene: ExportScene) -> int:
+    return ANTIALIASED if scene.antialiased else 0
 
 
 def encode_columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS) -> tuple[np.ndarray, ...]:
@@ -143,7 +151,7 @@ def _write_streams(file: IO[bytes], scene: ExportScene, spools: Mapping[str, IO[
     import zstandard
 
     filled = [spool for spool in spools.values() if spool.seek(0, 2)]
-    head = HEADER_4.pack(MAGIC, 4, scene.count, scene.degree, FRACTION_BITS, 0, len(filled), HEADER_4.size)
+    head = HEADER_4.pack(MAGIC, 4, scene.count, scene.degree, FRACTION_BITS, _flags(scene), len(filled), HEADER_4.size)
     file.write(head + bytes(SIZES.size * len(filled)))
     sizes = b""
     for spool in filled:
@@ -243,7 +251,7 @@ def decode_spz(data: bytes, path: Path) -> Iterator[Gaussians]:
         or fields[1] not in (2, 3)
     ):
         raise VdgsError(f"{path}: is no SPZ of versions 2 to 4.")
-    _, version, n, degree, fraction, _, _ = fields
+    _, version, n, degree, fraction, flags, _ = fields
     if degree > MAX_SH_DEGREE:
         raise VdgsError(
             f"{path}: has spherical harmonics of degree {degree}, and vdgs reads those up to {MAX_SH_DEGREE}. Write it "
@@ -251,8 +259,11 @@ def decode_spz(data: bytes, path: Path) -> Iterator[Gaussians]:
         )
     rest = num_sh_bases(degree) - 1
     widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest)
-    if len(data) != HEADER_STRUCT.size + n * sum(widths):
+    whole = HEADER_STRUCT.size + n * sum(widths)
+    if len(data) < whole or (len(data) > whole and not flags & HAS_EXTENSIONS):  # extensions follow the Gaussians
         raise VdgsError(f"{path}: is shorter or longer than its {n} Gaussians. It is damaged; write it again.")
+    if flags & ANTIALIASED:
+        warn_antialiased(path)
     parts, start = [], HEADER_STRUCT.size
     for width in widths:
         parts.append(np.frombuffer(data, np.uint8, n * width, start).reshape(n, width))
