@@ -170,6 +170,15 @@ def test_a_finished_run_does_nothing_again(capture, copied):
     assert changed_files(copied, before) <= {"report.html", ".run/progress.json"}
 
 
+def test_damaged_counts_of_cameras_are_counted_again(copied):
+    file = copied / "visibility" / "visibility.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    done = vdgs("visibility", copied)
+    assert done.returncode == 0, done.stderr
+    assert file.read_bytes() == whole
+
+
 def test_models_that_were_cut_off_are_made_again_with_the_same_bits(capture, copied):
     models = {copied / stage / "model.safetensors" for stage in ("coarse", "blocks/00", "merged")}
     before = {file: file.read_bytes() for file in models}

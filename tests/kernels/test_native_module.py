@@ -46,7 +46,8 @@ def test_environment_chooses_instruction_set_and_threads() -> None:
     ("variable", "value", "message"),
     [
         ("VDGS_ISA", "sse9", "no kernels for 'sse9'"),
-        ("VDGS_THREADS", "many", "whole number from 1, not 'many'"),
+        ("VDGS_THREADS", "many", "whole number from 1 to 1024, not 'many'"),
+        ("VDGS_THREADS", "99999", "whole number from 1 to 1024, not '99999'"),
     ],
 )
 def test_environment_errors_say_what_is_wrong(variable: str, value: str, message: str) -> None:

@@ -59,6 +59,38 @@ def test_threads_are_set_up_before_callers_load_torch_and_numpy():
     assert done.stdout.split() == ["PASSIVE", "4"]
 
 
+FORKING = """
+import os, sys, numpy as np, vdgs
+points = np.random.default_rng(0).uniform(-5, 5, (200_000, 3))
+K = np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]])
+cameras = vdgs.cameras_from(np.eye(4)[None].repeat(9, 0), K, 320, 240)
+vdgs.configure_threads(2)
+seen = vdgs.count_visibility(points, cameras)
+child = os.fork()
+if not child:
+    os._exit(0 if (vdgs.count_visibility(points, cameras) == seen).all() else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def test_a_forked_child_computes_what_its_parent_computes():
+    """OpenMP's threads of the parent, for which torch's would wait without end, are not the child's."""
+    subprocess.run([sys.executable, "-c", FORKING], check=True, timeout=60)
+
+
+def test_the_warnings_of_a_caller_stay_as_they_are(native_small):
+    code = """
+import sys, warnings, vdgs
+vdgs.load_capture(sys.argv[1], up="z")
+import vdgs.system.figure_style
+print([each for each in warnings.filters if any(name in str(each) for name in ("PIL", "Glyph"))])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, native_small.capture], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"
+
+
 def test_the_stub_names_what_is_there():
     tree = ast.parse(STUB.read_text(encoding="utf-8"))
     stubbed = {alias.asname for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}

@@ -328,6 +328,18 @@ def test_what_is_no_tensor_is_named():
         draw(given | {"means": np.full((60, 3), None)})
 
 
+def test_cameras_that_would_be_misread_are_named():
+    given = scene()
+    for name, wrong, message in (
+        ("Ks", given["Ks"].transpose(-1, -2), "^Ks have their translation in the last row: transpose them"),
+        ("viewmats", given["viewmats"].transpose(-1, -2), "^viewmats have their translation in the last row"),
+        ("Ks", given["Ks"] * torch.nan, "^Ks hold what is no finite number"),
+        ("viewmats", given["viewmats"] / 0, "^viewmats hold what is no finite number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            draw(given | {name: wrong.contiguous()})
+
+
 @pytest.mark.parametrize("name", ["width", "height", "tile_size", "sh_degree"])
 @pytest.mark.parametrize("value", ["44", 4.5, -1])
 def test_numbers_that_are_not_whole_are_named(name, value):

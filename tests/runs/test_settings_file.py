@@ -96,6 +96,7 @@ def test_a_run_that_is_there_keeps_its_settings(tmp_path):
     ("text", "says"),
     [
         ("trainign: {seed: 1}", "there is no setting 'trainign'; did you mean 'training'?"),
+        ("iterations: 60", "there is no setting 'iterations'; it stands in training and in block"),
         ("training: {densify: {evry: 1}}", "training.densify has no 'evry'; did you mean 'every'?"),
         ("capture: {image: images_4}", "capture has no 'image'; did you mean 'images'?"),
         ("partition: {lambda_vis: .nan}", "settings.yaml: --lambda-vis nan"),

@@ -7,7 +7,6 @@ verbs decode it by `decode_image`, to sRGB.
 from __future__ import annotations
 
 import io
-import os
 import threading
 import warnings as python_warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -39,11 +38,6 @@ from vdgs.errors import CaptureError
 from vdgs.system.memory.process_memory import is_out_of_memory
 from vdgs.system.native_messages import without_decoder_messages
 from vdgs.system.permissions import refusal
-
-# What libraries say of files on their own is for their makers: what cannot be read is said in our words.
-python_warnings.filterwarnings("ignore", module=r"PIL\.")
-if "OPENCV_LOG_LEVEL" not in os.environ:
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 #: Maker and model of a camera in EXIF.
 _CAMERA_TAGS, _ORIENTATION = {0x010F, 0x0110}, 0x0112

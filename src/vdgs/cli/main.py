@@ -82,11 +82,13 @@ def _run_command(command: str, arguments: list[str]) -> int:
     import os
 
     from vdgs.cli.advice import MESSAGE_FIT, Advice
+    from vdgs.system.native_messages import quiet_libraries
 
     # Before numpy, whose matrices here are thin: OpenBLAS would wake its threads for them, which wait by spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # matplotlib warns of a home folder without write access, and then works without it.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    quiet_libraries()
     if os.environ.get("COLUMNS") == "0":  # no width is known; rich would print nothing
         del os.environ["COLUMNS"]
     kept = command in RESUMABLE_COMMANDS and "--dry-run" not in arguments

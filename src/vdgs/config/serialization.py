@@ -52,7 +52,7 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings", *,
     that it all stands in; `numeric_text` says whether a text may stand for a number, as in files.
     """
     hints = field_hints(kind)
-    _check_names(values, hints, where)
+    _check_names(values, kind, where)
     inside = {name: f"{where}.{name}".lstrip(".") for name in values}
     read = _read_words if numeric_text else partial(read_value, numeric_text=False)
     return kind(**{name: read(hints[name], value, inside[name]) for name, value in values.items()})
@@ -66,7 +66,7 @@ def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -
     if not isinstance(values, Mapping):
         raise ValueError(f"{where} is {values!r}, not a group of settings")
     hints, flat = field_hints(kind), dict[tuple[str, ...], Any]()
-    _check_names(values, [*hints, *also], where)
+    _check_names(values, kind, where, also)
     for name, value in values.items():
         inner, inside = without_notes(hints[name]), f"{where}.{name}".lstrip(".")
         if dataclasses.is_dataclass(inner):
@@ -78,11 +78,20 @@ def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -
     return flat
 
 
-def _check_names(values: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+def _check_names(values: Mapping[str, Any], kind: type, where: str, also: Iterable[str] = ()) -> None:
+    known = [*field_hints(kind), *also]
     unknown = sorted(values.keys() - set(known), key=str)
     if unknown:
         what = f"{where} has no" if where else "there is no setting"
-        raise ValueError(f"{what} {unknown[0]!r}{suggest(str(unknown[0]), known)}")
+        meant = _in_groups(kind, str(unknown[0])) or suggest(str(unknown[0]), known)
+        raise ValueError(f"{what} {unknown[0]!r}{meant}")
+
+
+def _in_groups(kind: type, name: str) -> str:
+    """`; it stands in training` of a setting that the groups of a config class have, and not the class."""
+    hints = {group: without_notes(hint) for group, hint in field_hints(kind).items()}
+    groups = [group for group, hint in hints.items() if dataclasses.is_dataclass(hint) and name in field_hints(hint)]  # type: ignore[arg-type]
+    return f"; it stands in {' and in '.join(groups)}" if groups else ""
 
 
 def suggest(word: str, known: Iterable[str]) -> str:

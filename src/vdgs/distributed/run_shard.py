@@ -27,7 +27,9 @@ def main(arguments: Sequence[str]) -> int:
     args = parser.parse_args(arguments)
 
     from vdgs.system.exit_codes import exit_code_of
+    from vdgs.system.native_messages import quiet_libraries
 
+    quiet_libraries()
     return exit_code_of("vdgs shard", lambda: _run(args), "The same command continues: what is finished is kept.")
 
 

@@ -39,8 +39,19 @@ def _implementation(device_type: str, name: str) -> KernelBackend:
     if name not in ("", "cpu", "torch_ref", "gpu"):
         raise VdgsError(f"{KERNELS_ENV_VAR} must be cpu, torch_ref, gpu or not set, not {name!r}.")
     name = name if name in ("torch_ref", "gpu") else {"cpu": "cpu", "cuda": "gpu"}.get(device_type, "torch_ref")
+    _survive_forks()
     backend: KernelBackend = import_module(f"vdgs.kernels.{name}")  # type: ignore[assignment]
     return backend
+
+
+@cache
+def _survive_forks() -> None:
+    """Let forked children of this process compute with one thread of torch: they have none of its OpenMP threads, for
+    which the first parallel operation would wait without end. The pool of the kernels begins anew by itself."""
+    import torch
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def get_num_threads() -> int:

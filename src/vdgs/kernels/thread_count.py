@@ -7,6 +7,9 @@ import os
 
 from vdgs.errors import VdgsError
 
+#: As `--threads` has it: more than any machine has cores, and few enough to start.
+MAX_NUM_THREADS = 1024
+
 
 def cpu_count() -> int:
     """The number of cores that this process may use: those that it is bound to, or fewer where the quota of a control
@@ -23,6 +26,6 @@ def default_num_threads() -> int:
     text = os.environ.get("VDGS_THREADS")
     if not text:
         return cpu_count()
-    if not text.isdecimal() or int(text) < 1:
-        raise VdgsError(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
+    if not text.isdecimal() or not 1 <= int(text) <= MAX_NUM_THREADS:
+        raise VdgsError(f"VDGS_THREADS must be a whole number from 1 to {MAX_NUM_THREADS}, not {text!r}.")
     return int(text)

@@ -249,10 +249,21 @@ def _check_gaussians(sh_degree: int | None, tensors: dict[str, Tensor]) -> _Gaus
         raise UnsupportedOption(f"sh_degree={sh_degree}: spherical harmonics go to degree {MAX_SH_DEGREE} here")
     if sh_degree is not None and num_sh_bases(sh_degree) > colors.shape[-2]:
         raise ValueError(f"sh_degree={sh_degree} needs {num_sh_bases(sh_degree)} bases, not {colors.shape[-2]}")
-    if bool((tensors["Ks"][..., 0, 1] != 0).any()):
-        raise UnsupportedOption("Ks: a camera has skew, which vdgs.ops.rasterization has not")
+    _check_cameras(tensors["viewmats"], tensors["Ks"])
     flat = {name: tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :]) for name, tensor in tensors.items()}
     return _Gaussians(batch=batch, **(flat | {"colors": flat["colors"] if own else flat["colors"][:, None]}))
+
+
+def _check_cameras(viewmats: Tensor, Ks: Tensor) -> None:
+    """Raise for matrices without numbers, for transposed ones, and for lenses that are not drawn."""
+    for name, matrices in (("viewmats", viewmats), ("Ks", Ks)):
+        if not bool(matrices.isfinite().all()):
+            raise ValueError(f"{name} hold what is no finite number")
+        below, aside = (matrices[..., -1, :-1] != 0).any(-1), (matrices[..., :-1, -1] != 0).any(-1)
+        if bool((below & ~aside).any()):
+            raise ValueError(f"{name} have their translation in the last row: transpose them")
+    if bool((Ks[..., 0, 1] != 0).any() or (Ks[..., 1, 0] != 0).any()):
+        raise UnsupportedOption("Ks: a camera has skew, which vdgs.ops.rasterization has not")
 
 
 class _Image(NamedTuple):

@@ -13,14 +13,15 @@ from vdgs.partition.plots import block_maps as figures
 from vdgs.runs.open_run import check_has_anchors
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.visibility_store import load_or_count_visibility
+from vdgs.runs.visibility_store import load_or_count_visibility, read_visibility
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.visibility.visibility_counts import visibility_stats
 
 
 def is_visibility_counted(run: RunFolder) -> bool:
-    """Whether `count_run_visibility` has nothing to do."""
-    return read_json_or_empty(run.visibility / "visibility.json").get("key") == run.keys().visibility
+    """Whether `count_run_visibility` has nothing to do: both files are there, whole and of this coarse model."""
+    said = read_json_or_empty(run.visibility / "visibility.json").get("key")
+    return said == run.keys().visibility and read_visibility(run) is not None
 
 
 def count_run_visibility(context: RunContext, console: Console) -> None:

@@ -30,7 +30,7 @@ def get_run_visibility(opened: OpenedModel, cameras: Sequence[Camera]) -> Int32[
     `cameras` are the training cameras of the run. Read where it is saved for this coarse model, else counted, as for a
     merged model.
     """
-    saved = _read(opened.folder) if opened.name == "coarse" else None
+    saved = read_visibility(opened.folder) if opened.name == "coarse" else None
     if saved is None or len(saved) != len(opened.model.anchors):
         return count_visibility(opened.model.anchors.positions, list(cameras))
     return saved.to(opened.device)
@@ -52,7 +52,7 @@ def require_some_seen(visibility: Real[Tensor, " n"], min_visibility: int) -> No
 
 def load_or_count_visibility(opened: OpenedRun) -> Int32[Tensor, " n"]:
     """As `get_run_visibility` of a run opened with its coarse model, in main memory; saved if it was not."""
-    run, saved = opened.folder, _read(opened.folder)
+    run, saved = opened.folder, read_visibility(opened.folder)
     if saved is not None and len(saved) == len(opened.model.anchors):
         return saved
     cameras = [view.camera for view in opened.capture.train_views]
@@ -62,7 +62,7 @@ def load_or_count_visibility(opened: OpenedRun) -> Int32[Tensor, " n"]:
     return tensors["visibility"]
 
 
-def _read(run: RunFolder) -> Int32[Tensor, " n"] | None:
+def read_visibility(run: RunFolder) -> Int32[Tensor, " n"] | None:
     """V as saved for the run's coarse model; None where it is not, or is damaged: it is then counted again."""
     file = run.visibility / VISIBILITY_FILE
     if not file.exists():

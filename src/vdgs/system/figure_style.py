@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,8 +23,6 @@ TEXT_SIZE, NOTE_SIZE = 11.0, 10.0
 #: Smallest size of a title that is too long.
 MIN_TITLE_SIZE = 4.0
 
-# Names in scripts that the font lacks are drawn as boxes, without a line of source for each letter.
-warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from font")
 #: Places axes in a figure by left, bottom, width, height in inches.
 PlaceAxes = Callable[[float, float, float, float], Axes]
 

@@ -1,4 +1,4 @@
-"""Discards what image libraries print about files, past every logger: errors come as exceptions.
+"""Discards what image libraries say about files on their own: errors come as exceptions, and are said in our words.
 
 libjpeg and libpng write to the file descriptor of standard error. While at least one thread decodes, the descriptor
 leads into a temporary file; afterwards the lines of others in this file are written to standard error.
@@ -10,6 +10,7 @@ import os
 import re
 import tempfile
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
@@ -23,6 +24,15 @@ _THEIRS = re.compile(
 _lock, _threads = threading.Lock(), 0
 #: The real standard error, and the file that replaces it.
 _redirected: tuple[int, IO[bytes]] | None = None
+
+
+def quiet_libraries() -> None:
+    """Let Pillow and matplotlib's fonts not warn and OpenCV not log in this process, nor OpenCV in its children, unless
+    OPENCV_LOG_LEVEL asks for it. For processes of vdgs alone, before OpenCV is imported: others set that themselves."""
+    warnings.filterwarnings("ignore", module=r"PIL\.")
+    # Names in scripts that the font lacks are drawn as boxes, without a line of source for each letter.
+    warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from font")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 
 @contextmanager
