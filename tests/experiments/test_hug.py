@@ -96,7 +96,7 @@ def test_a_block_learns_its_own_pixels_and_no_others(capture):
             return image, mask
 
     with open_training_images(capture, config.training, 10**8) as images:
-        picture, mask = MaskedImages(images, grids).get(0)
+        _, mask = MaskedImages(images, grids).get(0)
         assert torch.equal(mask.bool(), (torch.arange(48) < 24).expand(36, 48))
         for painted in (slice(0, 0), slice(24 + 5, 48), slice(0, 24)):  # 5 pixels reach half of SSIM's window
             repainted = Repainted(images, grids)
