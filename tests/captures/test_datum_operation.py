@@ -111,3 +111,9 @@ def test_earth_centred_metres_of_a_datum_come_by_the_same_operation(code):
     centred = np.stack(pyproj.Transformer.from_crs(code, earth, always_xy=True).transform(*surveyed.T), axis=1)
     back = drawn.from_geodetic(geocentric_to_geodetic(pyproj.CRS(code).to_wkt("WKT1_GDAL"), FILE)(centred))
     np.testing.assert_allclose(back[:, :2], surveyed[:, :2], rtol=0, atol=2e-3)
+
+
+def test_degrees_from_another_meridian_of_one_datum_are_as_good():
+    """A conversion without a datum's shift, though longitudes differ by more than two degrees."""
+    system = "+proj=utm +zone=31 +datum=WGS84 +pm=paris"
+    assert datum_error(system, np.array([[48.8, 2.4, 100.0]])) == (0.0, "")

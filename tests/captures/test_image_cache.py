@@ -211,6 +211,17 @@ def test_masks_keep_white_and_shrink_carefully(tmp_path, views):
     assert small.shape == (HEIGHT // 2, WIDTH // 2)
 
 
+def test_of_a_photograph_with_a_mask_and_holes_counts_what_both_keep(tmp_path):
+    keep, alpha = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    keep[:, 31:], alpha[:20] = 255, 255
+    Image.fromarray(keep).save(tmp_path / "mask.png")
+    Image.fromarray(np.dstack([picture(), alpha])).save(tmp_path / "holes.png")
+    view = make_view(tmp_path / "holes.png", tmp_path / "mask.png")
+    np.testing.assert_array_equal(load_image(view).mask.numpy(), (keep & alpha) // 255)
+    holes = load_image(make_view(tmp_path / "holes.png")).mask
+    np.testing.assert_array_equal(holes.numpy(), alpha // 255)
+
+
 def test_an_image_that_changed_shape_since_the_check_is_named(views):
     Image.fromarray(picture().transpose(1, 0, 2).copy()).save(views[0].image_path)
     with ImageCache(views, 10**6) as cache, pytest.raises(CaptureError, match="is 41x60 now"):

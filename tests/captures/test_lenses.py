@@ -160,6 +160,19 @@ def test_a_fisheye_that_sees_behind_itself_becomes_a_pinhole():
     assert np.isfinite(sampling_map(small, pinhole)).all()
 
 
+def test_what_a_lens_does_not_take_lies_outside_its_picture():
+    """So that it is blank, and not the color of a corner."""
+    lens = Intrinsics("SIMPLE_DIVISION", (40.0, 40.0, 30.0, 0.1), 80, 60)
+    wide = Intrinsics("PINHOLE", (8.0, 8.0, 40.0, 30.0), 80, 60)
+    rows, columns = np.mgrid[:60, :80] + 0.5
+    rays = np.stack([(columns - 40) / 8, (rows - 30) / 8], axis=-1).reshape(-1, 2)
+    taken = np.isfinite(ray_pixels(lens, rays)).all(axis=1).reshape(60, 80)
+    grid = sampling_map(lens, wide)
+    assert 0 < taken.mean() < 1
+    assert np.isfinite(grid).all()
+    assert grid[~taken].max() < -1
+
+
 def test_colmap_models_know_no_such_lens(tmp_path: Path):
     from vdgs.captures.formats.colmap import read_colmap
 

@@ -48,6 +48,13 @@ def test_opensfm_is_read_to_its_numbers(tmp_path: Path, flight: KnownFlight) -> 
     assert (source.colors == flight.colors).all()
 
 
+def test_pixels_of_opensfm_may_be_wider_than_high(tmp_path: Path, flight: KnownFlight) -> None:
+    oblong = replace(flight, lens=replace(flight.lens, aspect=1.02))
+    writers.write_opensfm(tmp_path, oblong)
+    oblong.write_photographs(tmp_path / "images")
+    check_numbers(read(tmp_path, "opensfm"), oblong)
+
+
 @pytest.mark.parametrize("program", ["opensfm", "openmvg", "visualsfm", "pix4d"])
 def test_exports_in_utf_16_are_read(tmp_path: Path, flight: KnownFlight, program: str) -> None:
     flight.write_photographs(tmp_path / "images")

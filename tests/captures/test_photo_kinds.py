@@ -169,6 +169,15 @@ def test_16_bits_become_8(tmp_path, suffix, gray):
     assert np.array_equal(middles(decode_image(file)[0]), expected)
 
 
+def test_16_bits_become_the_nearest_of_8(tmp_path):
+    import cv2
+
+    deep = np.random.default_rng(0).integers(0, 2**16, (50, 40, 3), dtype=np.uint16)
+    deep.flat[:4] = 0, 128, 129, 65535
+    cv2.imwrite(str(tmp_path / "a.png"), deep[..., ::-1])
+    assert np.array_equal(decode_image(tmp_path / "a.png")[0], np.rint(deep / 257))
+
+
 def test_12_bits_in_16_are_refused_with_the_remedy(tmp_path):
     import cv2
 

@@ -169,6 +169,20 @@ def test_appearance_begins_as_the_identity_and_learns_a_darker_photograph():
     assert float(value.l1) < 0.5 * float(loss(image, dark, None, 1, initial_appearance(2, 0)).l1)
 
 
+def test_appearance_explains_colors_and_never_structure():
+    """A map of 2 sigmoid(-1) everywhere: L1 is of the picture times the map, SSIM of the picture itself."""
+    extra = initial_appearance(1, 0)
+    extra[f"weight.b{max(int(name[8:]) for name in extra if name.startswith('weight.b'))}"].fill_(-1.0)
+    image = torch.rand(16, 20, 3, generator=torch.Generator().manual_seed(0))
+    target = (image * 137).to(torch.uint8)
+    found = AppearanceLoss(0.2)(image, target, None, 0, extra)
+    colors = (image * 2 / (1 + np.exp(1)) - target / 255).abs().mean()
+    structure = get_backend(image.device).photometric_loss(image, target, None, ssim_weight=1.0)
+    torch.testing.assert_close(found.l1, colors)
+    torch.testing.assert_close(found.ssim, structure.ssim)
+    torch.testing.assert_close(found.loss, 0.8 * colors + 0.2 * (1 - structure.ssim))
+
+
 def test_a_stopped_scene_continues_with_its_appearance(capture, tmp_path, monkeypatch):
     train = gaussian_session.train
 

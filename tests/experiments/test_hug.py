@@ -10,16 +10,19 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments.baselines.hug.partition import cut_ground, pixel_owners
-from experiments.baselines.hug.run import level_weights, levels_at, run_hug
+from experiments.baselines.hug.run import MaskedImages, level_weights, levels_at, run_hug
 from experiments.baselines.hug.settings import HugConfig, hug_config
-from experiments.baselines.octree_gs.levels import Octree
+from experiments.baselines.octree_gs.levels import Octree, fit_octree
 from experiments.baselines.octree_gs.model import OctreeModel
 from experiments.baselines.octree_gs.run import run_octree
+from experiments.baselines.octree_gs.training import octree_problem, octree_state
 from support.captures import tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
+from vdgs.pipeline.train_coarse import open_training_images
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json
+from vdgs.training import to_checkpoint, train_step
 
 pytestmark = pytest.mark.xdist_group("octree_gs")
 QUIET = Console(quiet=True)
@@ -77,6 +80,36 @@ def test_every_pixel_has_one_block_that_of_what_it_shows(capture):
     assert shares.min() > 0.2
 
 
+def test_a_block_learns_its_own_pixels_and_no_others(capture):
+    """A step does not see what the others show, and does see what its own do."""
+    config, cameras = short(1).octree, [view.camera for view in capture.train_views]
+    grids = [np.arange(8)[None] < np.full((6, 1), 4) for _ in cameras]  # the left half
+    octree, stepped = fit_octree(capture.points, cameras, config), []
+
+    class Repainted(MaskedImages):
+        painted = slice(0, 0)
+
+        def get(self, index, downscale=1):
+            image, mask = super().get(index, downscale)
+            image = image.clone()
+            image[:, self.painted] = 255 - image[:, self.painted]
+            return image, mask
+
+    with open_training_images(capture, config.training, 10**8) as images:
+        _, mask = MaskedImages(images, grids).get(0)
+        assert torch.equal(mask.bool(), (torch.arange(48) < 24).expand(36, 48))
+        for painted in (slice(0, 0), slice(24 + 5, 48), slice(0, 24)):  # 5 pixels reach half of SSIM's window
+            repainted = Repainted(images, grids)
+            object.__setattr__(repainted, "painted", painted)
+            problem = octree_problem(capture, config, octree, repainted, cameras)
+            state = octree_state(capture.points, cameras, problem, octree)
+            train_step(state, problem)
+            stepped.append({name: tensor.numpy().tobytes() for name, tensor in to_checkpoint(state).tensors.items()})
+    whole, others, own = stepped
+    assert others == whole
+    assert own != whole
+
+
 def test_levels_are_drawn_as_often_as_their_weight_in_the_loss():
     weights = level_weights(4, 0.2, 1.0)
     # Three levels below the full picture: k = 3 is the coarsest.
@@ -101,13 +134,15 @@ def test_one_block_that_is_drawn_at_all_levels_is_octree_gs(capture, tmp_path):
     assert torch.equal(hug.levels, octree.levels)
 
 
-def test_blocks_are_merged_by_place_and_their_costs_noted(capture, tmp_path):
-    run = RunFolder(tmp_path)
+def test_blocks_are_merged_by_place_and_their_costs_noted(capture, tmp_path, monkeypatch):
+    run, masked, get = RunFolder(tmp_path), [], MaskedImages.get
+    monkeypatch.setattr(MaskedImages, "get", lambda *of: masked.append(of) or get(*of))
     figures = run_hug(run, capture, short(2), QUIET)
     model = OctreeModel.load(tmp_path / "hug")
     boxes, positions = cut_ground(capture.points, 2), model.anchors.anchors.positions
     for block, (first, last, _) in enumerate(model.anchors.decoder_ranges()):
         assert bool(boxes.holds(block, positions[first:last, :2]).all())
+    assert len({id(images) for images, *_ in masked}) == 2  # each from its own pixels
     costs = read_json(tmp_path / "hug" / "costs.json")
     assert costs["blocks"] == 2
     assert costs["block_seconds"] >= costs["longest_block_seconds"] > 0

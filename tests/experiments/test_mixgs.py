@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from rich.console import Console
@@ -9,7 +10,7 @@ from rich.console import Console
 from experiments.baselines.gs3d.model import GaussianModel
 from experiments.baselines.gs3d.run import train_gs3d
 from experiments.baselines.gs3d.training import Gs3dProblem, from_checkpoint, scene_extent, to_checkpoint
-from experiments.baselines.mixgs.model import MixModel, MixScene, encode_places, mix_scene
+from experiments.baselines.mixgs.model import MixModel, MixScene, decode_details, encode_places, mix_scene
 from experiments.baselines.mixgs.run import run_mixgs
 from experiments.baselines.mixgs.settings import mix_config
 from experiments.baselines.mixgs.training import MixProblem, mixed_state, network_of, train_mixed
@@ -61,6 +62,29 @@ def test_the_encoding_is_the_tables_at_grid_corners_and_linear_between_them():
     table.requires_grad_()
     encode_places(torch.tensor([[2.25, 5, 3]]), table, scene).sum().backward()
     assert table.grad.sum() == pytest.approx(2.0)  # of each feature the weights of eight corners
+
+
+def test_details_follow_the_networks_formula(capture, coarse):
+    """Written out in other words, with a network and offsets that are far from where they begin."""
+    state, scene = mixed_state(coarse, replace(CONFIG, min_opacity=0.0))
+    generator, camera = torch.Generator().manual_seed(0), capture.test_views[0].camera
+    random = lambda shape: torch.randn(shape, generator=generator)  # noqa: E731
+    network = {name: random(tensor.shape) for name, tensor in network_of(state).items()}
+    offsets = random(coarse.means.shape)
+    details, colors, opacities = decode_details(coarse, offsets, network, scene, camera)
+    layer = lambda name, x: x @ network[f"{name}.w"].T + network[f"{name}.b"]  # noqa: E731
+    turned, sizes = torch.nn.functional.normalize(coarse.quaternions), coarse.log_scales.exp() / scene.scale_unit
+    pose = torch.from_numpy((camera.camera_from_world[:3, 3] / scene.size).astype(np.float32)).repeat(len(coarse), 1)
+    gate = torch.tanh(layer("pose", torch.cat([pose, sizes, turned], dim=1)).clamp(min=0) / 2)  # 2 sigmoid(x) - 1
+    hidden = layer("hidden", gate * layer("place", encode_places(coarse.means, network["table"], scene))).clamp(min=0)
+    torch.testing.assert_close(details.means, coarse.means + offsets)
+    torch.testing.assert_close(
+        details.quaternions, torch.nn.functional.normalize(turned + layer("rotation", hidden)), rtol=1e-3, atol=1e-4
+    )
+    decoded = layer("scale", hidden).clamp(min=0.01) * scene.scale_unit
+    torch.testing.assert_close(details.log_scales.exp(), decoded, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(colors, 1 / (1 + (-layer("color", hidden)).exp()), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(opacities, layer("opacity", hidden)[:, 0].sigmoid(), rtol=1e-3, atol=1e-4)
 
 
 def test_details_without_opacity_leave_the_coarse_scene(capture, coarse):

@@ -14,7 +14,8 @@ from support.checkerboard import Photographs
 from vdgs.config.method import BlockConfig, CompensationConfig
 from vdgs.model.decoder import EXPOSURE, Decoder
 from vdgs.model.renderer import cull_anchors
-from vdgs.training import initial_state, to_checkpoint, train
+from vdgs.training import initial_state, to_checkpoint, train, view_at
+from vdgs.training.training_loop import downscale_at
 
 PLAIN = replace(CONFIG, iterations=24, compensation=CompensationConfig(enabled=False))
 
@@ -100,6 +101,47 @@ def test_blocks_that_lag_weigh_more():
     weights.update(1, 20.0, 0.7)
     assert weights.weight(0) == 1.0
     assert weights.weight(1) == pytest.approx(2 - math.exp(-(5**2 + 1**2) / 200))
+
+
+def first_step(config: MomentumConfig, index: int) -> MomentumTraining:
+    """Two blocks, the second behind the first, beside a teacher with other heads, after one step of a block. First
+    moments are then a tenth of the gradients."""
+    training = blocks(2, replace(config, momentum=1.0))
+    for tensor in training.teacher.decoder.tensors().values():
+        tensor.mul_(0.5)
+    training.weights.update(0, 25.0, 0.8)
+    training.weights.update(1, 20.0, 0.7)
+    training.step(index)
+    return training
+
+
+def test_a_block_that_lags_moves_by_its_weight_times_its_gradients():
+    plain, weighed = (
+        first_step(MomentumConfig(consistency=0.0, weigh_blocks=weigh), 1).states[1].optimizer
+        for weigh in (False, True)
+    )
+    for alone, more in ((plain.anchors, weighed.anchors), (plain.decoder, weighed.decoder)):
+        for name, first in alone.first.items():
+            torch.testing.assert_close(more.first[name], (2 - math.exp(-(5**2 + 1**2) / 200)) * first)
+    assert plain.anchors.first["features"].any()
+
+
+def test_a_step_adds_consistency_to_the_gradients_of_the_decoder_alone():
+    plain, training = (first_step(MomentumConfig(consistency=c, weigh_blocks=False), 0) for c in (0.0, 50.0))
+    before = blocks(1, MomentumConfig()).states[0]
+    view = view_at(0, 8, PLAIN.seed)
+    camera = Photographs().camera(view, downscale_at(0, PLAIN))
+    for tensor in before.decoder.tensors().values():
+        tensor.requires_grad_()
+    rows = cull_anchors(before.anchors, camera)
+    added = training.teacher.gradients(before.anchors, rows, before.decoder, camera, 1.0)
+    assert len(added) == 12
+    assert all(gradient.any() for gradient in added.values())
+    alone, pulled = plain.states[0].optimizer, training.states[0].optimizer
+    for name, gradient in added.items():
+        torch.testing.assert_close(pulled.decoder.first[name], alone.decoder.first[name] + 0.1 * gradient)
+    for name, first in alone.anchors.first.items():
+        assert torch.equal(pulled.anchors.first[name], first)
 
 
 def test_turns_follow_from_the_steps_made():

@@ -170,6 +170,23 @@ def test_levels_follow_the_distances_of_the_cameras(capture):
     assert int(nearer.shown(places, levels, 9.0, cameras[0], finest).sum()) == 0  # its level is not open yet
 
 
+def test_a_view_shows_the_nearest_level_to_what_its_distance_asks_for():
+    octree = Octree(4, 1, 1.0, 8.0)
+    camera = tiny_scene().cameras["frame_000.png"]
+    asked = torch.tensor([0.4, 0.6, 1.4, 1.6, 9.0])  # nearer than the finest level's distance at the end
+    places = torch.from_numpy(camera.position).float() + torch.outer(8 / 2**asked, torch.tensor([0.0, 0.0, 1.0]))
+
+    def finest(octree: Octree, bias: float) -> list[int]:
+        shown = [
+            octree.shown(places, torch.full((5,), level, dtype=torch.int32), bias, camera, 4) for level in range(4)
+        ]
+        return (torch.stack(shown).sum(dim=0) - 1).tolist()
+
+    assert finest(octree, 0.0) == [0, 1, 1, 2, 3]
+    assert finest(octree, 0.2) == [1, 1, 2, 2, 3]
+    assert finest(replace(octree, round_down=True), 0.0) == [0, 0, 1, 1, 3]
+
+
 def replace_distance(octree: Octree, distance: float) -> Octree:
     return replace(octree, distance=distance)
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from support.flown_models import flown_model
 from vdgs.sfm import georegistration
-from vdgs.sfm.attitude_tilt import tilt_of_attitudes
+from vdgs.sfm.attitude_tilt import tilt_of_attitudes, tilt_of_views
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 
 TILT = np.radians([3.0, -2.0])
@@ -27,6 +27,13 @@ def tilted(
         rotations.append(noise @ hangs @ recorded.camera_from_enu @ world)
         gravity.append(recorded.gravity)
     return np.array(rotations), np.array(gravity)
+
+
+def test_the_tilt_of_views_is_that_from_straight_down():
+    ways = ((0.0, -90.0), (90.0, -80.0), (200.0, -30.0))  # of a gimbal, which is level at 0
+    views = [attitude_from_gimbal(yaw, pitch, 0.0).camera_from_enu for yaw, pitch in ways]
+    assert tilt_of_views(np.array(views)) == pytest.approx(10)
+    assert tilt_of_views(np.array(views[2:])) == pytest.approx(60)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.2])

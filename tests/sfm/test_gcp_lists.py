@@ -183,6 +183,10 @@ BAD = {
     "not finite": ([{"text": "nan 2 3 4 5 DJI_0001.JPG"}], "line 2: numbers must be finite"),
     "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], r"1 photographs that are not there; .*DJI_0999\.JPG"),
     "outside": ([{"text": "1 2 3 321 5 DJI_0001.JPG"}], "line 2: pixel 321, 5 is outside .* 320 x 240"),
+    "below": (
+        [{"text": "1 2 3 5 241 DJI_0001.JPG"}],
+        "line 2: pixel 5, 241 is outside .* 320 x 240.*exchanged, or was",
+    ),
     "two places": ([{}, {"x": 5.0}], "line 3: the point a has another place in line 2"),
     "too few points": ([{"name": "c"}] * 4, "another place"),
     "no place on Earth": ([{"x": 1e12}, {"x": 1e12}], "line 2: .* is no place in"),

@@ -28,7 +28,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm import feature_extraction, incremental_mapper, reconstruct
 from vdgs.sfm.image_list import collect_images
-from vdgs.sfm.mask_files import read_keep_mask, write_upright_masks
+from vdgs.sfm.mask_files import encode_mask, read_keep_mask, undistort_mask, write_upright_masks
 from vdgs.sfm.reconstruction_plan import plan_reconstruction, print_plan
 from vdgs.sfm.run_request import make_sfm_request
 from vdgs.sfm.step_keys import step_keys
@@ -298,3 +298,15 @@ def test_what_is_transparent_in_a_mask_is_not_kept(tmp_path):
             np.testing.assert_array_equal(decode_mask(tmp_path / "mask.png", 8, 6), expected)
     Image.fromarray(np.dstack([white, flat]), "LA").save(tmp_path / "mask.png")
     np.testing.assert_array_equal(decode_mask(tmp_path / "mask.png", 8, 6), np.broadcast_to(left, (6, 8)))
+
+
+def test_of_pixels_that_are_shrunk_together_all_must_be_kept(tmp_path):
+    """And of those that lie outside the photograph, none is."""
+    keep = np.ones((6, 8), bool)
+    keep[0, 0] = keep[5, 6] = False
+    (tmp_path / "mask.png").write_bytes(encode_mask(keep))
+    grid = np.stack(np.meshgrid(np.arange(10.0), np.arange(6.0)), axis=-1).astype(np.float32)
+    straight = undistort_mask(tmp_path / "mask.png", grid, (10, 6))
+    np.testing.assert_array_equal(straight, np.pad(keep, ((0, 0), (0, 2))))
+    halved = undistort_mask(tmp_path / "mask.png", grid, (5, 3))
+    np.testing.assert_array_equal(halved, straight.reshape(3, 2, 5, 2).all(axis=(1, 3)))

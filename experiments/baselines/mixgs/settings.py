@@ -4,7 +4,8 @@
 - the coarse Gaussians are trained here, as 3DGS, with a third of all iterations; the authors start from a finished
   model, and mix for ten times as long;
 - coarse Gaussians of opacity above 0.05 are kept, not above 0.5: after few iterations few are so opaque;
-- the hash tables have 16 levels and as many entries as there are Gaussians, not 32 levels of 4 million entries;
+- the hash tables have 16 levels, from a grid of 16 cells a side to one of 2048, each 1.38 times finer than the one
+  before, and as many entries as there are Gaussians; not 32 levels, from 32 cells on, of 4 million entries;
 - decoded scales are in units of the median size of the coarse Gaussians, not of the capture, and so is their minimum;
 - image formation is that of this project (docs/conventions.md), for all methods alike.
 """

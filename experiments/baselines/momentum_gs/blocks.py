@@ -6,6 +6,8 @@ Written from the paper, on this project's anchors and block training. Adapted:
   every block the whole coarse scene and keeps its cell;
 - consistency moves the decoder alone; in the program also the features of anchors;
 - a block is weighed by its training views as it meets them; the program asks views that are held out for it;
+- weights act from when every block has been measured to the end; in the program not in the first 1000 iterations, nor
+  where the decoder stays as it is;
 - turns are shorter where a block makes fewer than `MIN_ROUNDS` of the published ones.
 
 In the last round the first block alone moves the decoder, so that the others end with the one that draws them

@@ -253,8 +253,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         centers=centers, targets=enu, times=times, up=up, has_altitudes=has_altitudes,
         stated=deviations if are_told(deviations, said) else None, relative=relative_deviations(deviations),
     )  # fmt: skip
-    others = {"east and north": enu[:, [1, 0, 2]], "signs": enu * [-1.0, 1.0, 1.0]}
-    if sure and mirrored(centers, enu, direction, others):
+    image = enu * [-1.0, 1.0, 1.0]  # of which exchanged axes are a turn
+    if sure and mirrored(centers, enu, direction, {"the mirror image": image}):
         raise CaptureError(
             f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
             "minus sign of south or west missing? Mend the table, or leave --gps out."
