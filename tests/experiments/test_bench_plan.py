@@ -191,8 +191,13 @@ def test_default_and_paper_restart_the_coarse_stage_and_paper_leaves_our_choices
         "assignment.always_best", "assignment.min_cameras", "assignment.mode", "block.random_background",
         "block.margin", "block.mask_moving", "merge.rule", "training.optimizer", "training.model.bound_scales",
         "training.model.photograph_blur", "training.init.fill_gaps", "training.loss.background",
-        "training.loss.random_background", "training.model.background_model",
+        "training.loss.random_background", "training.model.background_model", "training.densify.start",
+        "training.densify.stop_fraction", "block.densify.start", "block.densify.stop_fraction",
     }  # fmt: skip
+    for growth, iterations in ((paper.training.densify, 100_000), (paper.block.densify, 50_000)):
+        steps = range(growth.every, int(growth.stop_fraction * iterations) + 1, growth.every)
+        decided = [step for step in steps if step >= growth.start]
+        assert (decided[0], decided[-1]) == (1_600, iterations // 2 - 100)  # as Scaffold-GS's program compares
     assert not validate_config(paper)
 
 

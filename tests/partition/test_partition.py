@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -94,10 +95,47 @@ def test_far_outliers_turn_no_axes() -> None:
 
 def test_positions_are_normalized_between_the_outermost_anchors_or_clipped() -> None:
     points = np.array([[0.0, 5.0]] * 50 + [[10.0, 7.0]] * 50 + [[1000.0, 6.0]])
-    features = clustering.clustering_features(points, np.arange(101), 0.5, 0.0)
+    config = PartitionConfig(lambda_vis=0.5, cluster_clip=0.0)
+    features = clustering.clustering_features(points, np.arange(101), config)
     assert np.allclose(features, np.column_stack([points[:, 0] / 1000, (points[:, 1] - 5) / 2, np.arange(101) / 200]))
-    clipped = clustering.clustering_features(points, np.arange(101), 0.5, 0.02)
+    clipped = clustering.clustering_features(points, np.arange(101), replace(config, cluster_clip=0.02))
     assert np.allclose(clipped[:, 0], [0.0] * 50 + [1.0] * 51)
+
+
+@pytest.mark.parametrize("clip", [0.0, 0.02])
+def test_positions_have_a_unit_for_each_axis_or_one_in_which_shapes_stay(clip: float) -> None:
+    points = np.random.default_rng(1).uniform(0, [400, 100], (500, 2))
+    visibility = np.arange(500)
+    config = PartitionConfig(cluster_clip=clip)
+    low, high = np.quantile(points, (clip, 1 - clip), axis=0)
+    by_axis = clustering.clustering_features(points, visibility, config)
+    assert np.array_equal(by_axis[:, :2], np.clip((points - low) / (high - low), 0.0, 1.0))  # the default, to the bit
+    common = clustering.clustering_features(points, visibility, replace(config, cluster_scale="common"))
+    assert np.allclose(common[:, :2], (np.clip(points, low, high) - low) / (high - low).max())
+    assert np.array_equal(common[:, 2], by_axis[:, 2])
+    line = np.column_stack([points[:, 0], np.full(500, 3.0)])  # a side without extent has no say
+    for each in (line, line[:, ::-1], np.full((500, 2), 3.0)):
+        assert np.isfinite(
+            clustering.clustering_features(each, visibility, replace(config, cluster_scale="common"))
+        ).all()
+
+
+def test_a_long_place_is_cut_otherwise_with_one_scale_and_a_square_one_alike() -> None:
+    generator = np.random.default_rng(2)
+    unit = generator.uniform(0, 1, (6000, 3))
+    unit[:2, :2] = [[0, 0], [1, 1]]
+    views = (40 * np.exp(-8 * ((unit[:, :2] - 0.5) ** 2).sum(1))).astype(np.int64)
+    plain = {"cluster_axes": "ground", "cluster_clip": 0.0}
+    cuts = {
+        (shape, scale): cut(unit * [shape, 100, 1], views, 4, cluster_scale=scale, **plain)
+        for shape in (100, 400) for scale in ("axis", "common")
+    }  # fmt: skip
+    places = 100 * generator.uniform(0, 1, (200, 2))
+    owners = {(shape, scale): blocks.owner(places * [shape / 100, 1]) for (shape, scale), blocks in cuts.items()}
+    assert np.array_equal(owners[100, "axis"], owners[100, "common"])
+    # Stretched, the clusters of the default are the same; the cells of the cores are not.
+    assert (owners[400, "axis"] == owners[100, "axis"]).mean() > 0.9
+    assert (owners[400, "common"] == owners[400, "axis"]).mean() < 0.8
 
 
 def test_components_are_sought_over_a_clusters_own_cells_or_where_it_is_strongest() -> None:

@@ -45,6 +45,14 @@ def test_settings_of_blocks_and_assignment_leave_what_is_before_them():
     assert changed.assignment != plain.assignment
 
 
+def test_the_readings_of_eq_5_and_of_eq_10_count_where_they_act():
+    compensation = replace(PLAIN.block.compensation, history="past")
+    changed, plain = keys(replace(PLAIN, block=replace(PLAIN.block, compensation=compensation))), keys(PLAIN)
+    assert (changed.assignment, changed.blocks == plain.blocks) == (plain.assignment, False)
+    changed = keys(replace(PLAIN, partition=replace(PLAIN.partition, cluster_scale="common")))
+    assert (changed.visibility, changed.partition == plain.partition) == (plain.visibility, False)
+
+
 def test_a_setting_counts_only_beside_the_one_that_it_needs():
     alone = replace(PLAIN, training=replace(PLAIN.training, exposure_min_spread=0.1))
     assert keys(alone) == keys(PLAIN)

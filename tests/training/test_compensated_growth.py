@@ -118,6 +118,19 @@ def test_compensation_adds_only_what_few_images_show():
     torch.testing.assert_close(compensated[low], 3 * plain[low])  # g = 2 times the mean of the first cycle
 
 
+def test_past_cycles_alone_are_added_where_that_is_asked():
+    """In the first cycle there is nothing yet; the cache then holds what it would hold with the present cycle."""
+    held = {}
+    for history in ("current", "past"):
+        compensation = CompensationConfig(t_low=1.0, beta_g=2.0, history=history)
+        strategy = CompensatedGrowth(compensation=compensation)
+        state = {"grad2d": torch.tensor([3.0]), "count": torch.tensor([6.0]), "seen": torch.tensor([1.0]),
+                 "views": 10, "cache": torch.zeros(1)}  # fmt: skip
+        held[history] = [(strategy._gradients(state).tolist(), state["cache"].tolist()) for _ in range(2)]
+    assert held["current"] == [([1.5], [1.0]), ([pytest.approx(2.4)], [pytest.approx(1.9)])]
+    assert held["past"] == [([0.5], [1.0]), ([1.5], [pytest.approx(1.9)])]
+
+
 def test_the_cache_decays_and_follows_its_gaussians():
     strategy = CompensatedGrowth(
         refine_start_iter=0, refine_every=2, grow_grad2d=1e-4, compensation=CompensationConfig(t_low=1.0)
@@ -141,6 +154,7 @@ def test_what_does_not_fit_is_said():
 @pytest.mark.parametrize(
     "wrong",
     [{"gamma": float("nan")}, {"gamma": 2.0}, {"beta_g": -5.0}, {"t_low": 20.0}, {"t_low": "0.2"}, {"target": "max"},
+     {"history": "none"},
      {"min_draws": "none"}, {"enabled": "yes"}],
     ids=str,
 )  # fmt: skip

@@ -16,6 +16,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.training.compensation import (
     CompensationState,
     begin_cycle,
+    close_cycle,
     compensate,
     cycle_gradient,
     cycle_log,
@@ -67,8 +68,7 @@ def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, grow
         change = None
         if config is not None:
             low, threshold = low_visibility_mask(share, config)
-            update_cache(memory, statistics, low, config)
-            change = compensate(memory, low, threshold, growth, config)
+            change = close_cycle(memory, statistics, low, threshold, growth, config)
         decision = decide_densification(anchors, statistics, 1.0, growth, g, compensated=change)
         kept = torch.cat([decision.keep_mask, torch.ones(len(decision.added), dtype=torch.bool)])
         anchors = anchors.concat(decision.added).select(kept)
@@ -138,6 +138,39 @@ def test_two_cycles_by_hand():
     see(statistics, torch.tensor([[4.0]]), torch.tensor([[0.25]]))
     update_cache(memory, statistics, NONE, PAPER)  # seen, but by enough cameras: only decay
     assert float(memory.cache) == pytest.approx(0.81)
+
+
+@settings(max_examples=20)
+@given(
+    cycles=st.lists(st.tuples(st.booleans(), st.integers(1, 50), st.floats(0, 1)), min_size=2, max_size=8),
+    target=st.sampled_from(["mean", "sum"]),
+)
+def test_a_decision_adds_the_cache_with_its_own_cycle_or_as_the_cycle_before_left_it(cycles, target):
+    """The cache is the same; only when it is read differs, and `current` is what it was before there was a choice."""
+    added, caches = {}, {}
+    for history in ("current", "past"):
+        config = replace(PAPER, history=history, target=target)
+        statistics, memory, changes, states = one_offset(), CompensationState.zeros(1, 1), [], [0.0]
+        for low, times, mean in cycles:
+            see(statistics, torch.tensor([[float(times)]]), torch.tensor([[mean]]))
+            change = close_cycle(memory, statistics, ALL if low else NONE, PAPER.t_low, GROWTH, config)
+            begin_cycle(memory, statistics)
+            changes.append(float(change.added))
+            states.append(float(memory.cache))
+        added[history], caches[history] = changes, states
+    assert caches["past"] == caches["current"]
+    marks = [low for low, _, _ in cycles]
+    assert added["current"] == [low * cache for low, cache in zip(marks, caches["current"][1:], strict=True)]
+    assert added["past"] == [low * cache for low, cache in zip(marks, caches["past"][:-1], strict=True)]
+
+
+def test_growth_follows_the_order_of_cache_and_decision():
+    """The default gives the bits of update and addition one after the other; without the ended cycle less grows."""
+    assert PAPER.history == "current"
+    current, past = simulate(PAPER, 5), simulate(replace(PAPER, history="past"), 5)
+    assert len(simulate(None, 5)[0]) < len(past[0]) < len(current[0])
+    first = [simulate(config, 5, cycles=1)[0] for config in (None, replace(PAPER, history="past"))]
+    assert torch.equal(first[0].positions, first[1].positions)  # nothing is remembered yet
 
 
 def test_fed_steadily_the_statistic_tends_to_21_times_its_size():

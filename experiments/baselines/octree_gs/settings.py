@@ -6,6 +6,9 @@
   the root, so that their voxel depends on the unit of the capture;
 - growth begins at the published share of the iterations but decides every 100 iterations whatever their number, since
   its statistics need so many views;
+- an anchor goes by the sum of its opacities over the number of views whose picture holds its center; the programs
+  count every view that may draw it;
+- finer cells are tried also where coarser ones added nothing, where that of Scaffold-GS goes on to the next;
 - the random numbers (first weights, views, which offsets are kept) are this package's;
 - image formation is that of this project (docs/conventions.md), for all methods alike.
 

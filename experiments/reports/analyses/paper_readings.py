@@ -39,6 +39,8 @@ Changes = dict[str, Any]
 SCENES = {
     "seneca": (("--images", "images_4", "--downscale", "2"), 8),
     "copr": (("--images", "images_4"), 4),
+    # of `vdgs synth DATA/corridor --flight corridor --num-images 80 --num-test-images 8 --width 160 --height 120`
+    "corridor": ((), 4),
     "horizon": ((), 4),  # of `vdgs synth DATA/horizon --flight horizon --size village --truth`: photographs show sky
 }
 #: 1 500 steps instead of 100 000, 200 for each block instead of 50 000; growth begins and is decided sooner.
@@ -59,6 +61,7 @@ BLOCKS: Changes = {"block.steps_scaler": 0.004, "block.densify.every": 20}
 #: Preset `default`'s partition, for the rows of one choice each.
 CUTS: dict[str, Changes] = {
     "cut: principal axes": {"partition.cluster_axes": "principal"},
+    "cut: one scale for both axes": {"partition.cluster_scale": "common"},
     "cut: clipped at 1 %": {"partition.cluster_clip": 0.01},
     "cut: own cells": {"partition.cluster_smoothing": 0.0},
     "cut: smoothed over 1.5 cells": {"partition.cluster_smoothing": 1.5},
@@ -98,6 +101,7 @@ READINGS: dict[str, Changes] = {
     "margin free": {"block.margin": "free"},
     "margin ramp, merge by owner": {"merge.rule": "owner"},
     "no compensation": {"block.compensation.enabled": False},
+    "g of past cycles": {"block.compensation.history": "past"},
     "g to means, lower gate": {"block.compensation.target": "mean", "block.compensation.min_draws": "scaled"},
     "g to sums, lower gate": {"block.compensation.target": "sum", "block.compensation.min_draws": "scaled"},
     "g to means, one gate": {"block.compensation.target": "mean", "block.compensation.min_draws": "paper"},
@@ -165,7 +169,7 @@ def own_cluster_share(run: RunFolder, visibility: np.ndarray) -> float:
     plane = fit_principal_plane(positions) if config.cluster_axes == "principal" else ground_plane()
     assert config.blocks != "auto"
     points = plane.to_plane(positions)
-    features = clustering_features(points, visibility, config.lambda_vis, config.cluster_clip)
+    features = clustering_features(points, visibility, config)
     order = np.lexsort((visibility, points[:, 1], points[:, 0]))
     labels = cluster_anchors(features[order], config.blocks, run.method().training.seed, config.balanced)
     owner = load_blocks(run.partition / "blocks.geojson").owner(positions[order])

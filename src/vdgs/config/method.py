@@ -138,6 +138,10 @@ class CompensationConfig:
     target: Literal["mean", "sum"] = "mean"
     """What g is added to; the paper says "the raw gradient statistics". `mean`: the mean gradient over the draws of an
     offset. `sum`: the sum before the division, so that g is divided by the draws too."""
+    history: Literal["current", "past"] = "current"
+    """Which cycles g holds when growth is decided; the paper does not say. `current`: the one that ends too, whose
+    gradients an offset of L then counts 1 + beta_g times. `past`: earlier ones alone; the one that ends joins g after
+    the decision."""
     min_draws: Literal["scaled", "paper"] = "scaled"
     """Above how many draws an offset of L is judged: `scaled` takes T_low times the gate of the others, at least 2
     (choice: within one cycle it can never pass theirs); `paper` the same as the others."""
@@ -239,6 +243,9 @@ class PartitionConfig:
     cluster_axes: Literal["principal", "ground"] = "principal"
     """Axes along which positions are normalized. `principal`: those of the anchors, so that the cut turns with the
     scene (choice). `ground`: x and y of the ground frame, as printed."""
+    cluster_scale: Literal["axis", "common"] = "axis"
+    """Unit of normalized positions; the paper says "normalized". `axis`: the extent along each axis, so that both run
+    from 0 to 1. `common`: the larger extent for both, so that distances are as on the ground."""
     cluster_clip: Annotated[float, Range(0, 0.5, exclusive_max=True)] = 0.01
     """Positions are normalized between this quantile and its opposite, and clipped; 0: between the outermost anchors
     (choice: outliers would squash the scene; the paper says "normalized")."""

@@ -1,8 +1,8 @@
 """Settings by name.
 
-`paper`     the paper as printed, but for the input of the decoder; where it is silent, the reading that served it best
-            on validation views or, where none clearly did, that of Scaffold-GS. docs/paper.md lists every choice, with
-            its alternatives.
+`paper`     the paper as printed, but for the input of the decoder and for the merge, which takes anchors of widened
+            blocks too; where it is silent, the reading that served it best on validation views or, where none clearly
+            did, what is nearest to Scaffold-GS. docs/paper.md lists every choice, with its alternatives.
 `default`   the paper's numbers, but a scene that can be used whatever the capture: axes that turn with the scene and
             smoothed cores; gaps filled; a random background, bounded Gaussians, sparse Adam; cameras by `coverage`,
             each with a block and each block with a hundred; and a frozen margin.
@@ -35,6 +35,9 @@ PresetName = Literal["default", "paper", "laptop"]
 #: `auto`: that of the run that is there, else `NEW_RUN_PRESET`.
 PresetChoice = Literal["auto", "laptop", "default", "paper"]
 
+#: Growth of Scaffold-GS's program: decisions after iteration 1 500 and before half of the iterations, both exclusive.
+_SCAFFOLD_GROWTH = DensifyConfig(start=1501, stop_fraction=0.49999)
+
 PRESETS: dict[str, MethodConfig] = {
     "default": MethodConfig(),
     "paper": MethodConfig(
@@ -42,11 +45,12 @@ PRESETS: dict[str, MethodConfig] = {
             optimizer="adam",
             model=ModelConfig(bound_scales=False, photograph_blur=False, background_model="off"),
             init=InitConfig(fill_gaps=False),
+            densify=_SCAFFOLD_GROWTH,
             loss=LossConfig(background="black", random_background=0.0),
         ),
         partition=PartitionConfig(cluster_axes="ground", cluster_clip=0.0, cluster_smoothing=0.5, min_block_share=0.0),
         assignment=AssignmentConfig(mode="paper", always_best=False, min_cameras=0),
-        block=BlockConfig(random_background=0.0, margin="ramp", mask_moving="off"),
+        block=BlockConfig(random_background=0.0, margin="ramp", mask_moving="off", densify=_SCAFFOLD_GROWTH),
         merge=MergeConfig(rule="max-visibility"),
     ),
     "laptop": MethodConfig(

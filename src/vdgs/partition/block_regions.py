@@ -51,7 +51,7 @@ def visible_anchors(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor,
 
 
 def growth_mask(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
-    """Which points may get new anchors: those whose anchors the merge takes from the block."""
+    """Which points may get new anchors: those the block owns (with a ring that is not frozen: its widened ones)."""
 
     def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
         points = xy_positions(positions)

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int64
 
+from vdgs.config.method import PartitionConfig
 from vdgs.errors import VdgsError
 from vdgs.visibility.visibility_counts import normalize_visibility
 
@@ -37,12 +38,18 @@ NUM_ITERATIONS = 3
 
 
 def clustering_features(
-    points: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float, clip_quantile: float
+    points: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], config: PartitionConfig
 ) -> Float[np.ndarray, "n 3"]:
-    """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1], clipped at the quantiles."""
+    """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1], clipped at the quantiles.
+
+    Each is in units of its own extent or, with `cluster_scale` common, both in units of the larger one.
+    """
+    clip_quantile, lambda_vis = config.cluster_clip, config.lambda_vis
     low, high = np.quantile(points, (clip_quantile, 1 - clip_quantile), axis=0)
     extent = np.where(high > low, high - low, 1.0)
     unit = np.clip((points - low) / extent, 0.0, 1.0)
+    if config.cluster_scale == "common" and (high > low).any():
+        unit *= (high - low) / (high - low).max()
     # Not 0 * V̂: without weight the visibility must leave no trace, not even -0.0.
     third = lambda_vis * normalize_visibility(visibility) if lambda_vis else np.zeros(len(points))
     return np.column_stack([unit, third])

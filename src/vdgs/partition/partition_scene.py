@@ -48,7 +48,7 @@ def partition_scene(
     ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
     plane = fit_principal_plane(ground) if config.cluster_axes == "principal" else ground_plane()
     points, visibility = _sorted(plane.to_plane(ground), visibility)
-    features = clustering_features(points, visibility, config.lambda_vis, config.cluster_clip)
+    features = clustering_features(points, visibility, config)
     labels = cluster_anchors(features, count, seed, config.balanced)
     candidates = block_cores(points, labels, count, config.cluster_smoothing)
     ordered = sorted(

@@ -15,15 +15,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vdgs.config.method import CompensationConfig
+from vdgs.config.method import CompensationConfig, DensifyConfig
 from vdgs.config.ranges import FRACTION, Range
 from vdgs.config.type_hints import field_hints
 from vdgs.config.validation_rules import checked_settings, checked_value
 from vdgs.errors import UnsupportedOption, check_kind
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.rotations import rotation_matrices
-from vdgs.training.compensation import CompensationState, low_visibility_mask, update_cache
-from vdgs.training.densification import CompensatedGradient
+from vdgs.training.compensation import CompensationState, close_cycle, low_visibility_mask
 
 #: A split Gaussian becomes two, so many times smaller (3DGS section 5.2).
 SPLIT_COUNT, SPLIT_SHRINK = 2, 1.6
@@ -162,11 +161,11 @@ class CompensatedGrowth:
         plain = state["grad2d"] / draws
         if not self.compensation.enabled:
             return plain
-        low, _ = low_visibility_mask(state["seen"] / max(state["views"], 1), self.compensation)
+        low, threshold = low_visibility_mask(state["seen"] / max(state["views"], 1), self.compensation)
         nothing, cache = torch.zeros_like(plain)[:, None], state["cache"][:, None]
         counted = DensificationStats(state["grad2d"][:, None], state["count"][:, None], plain, state["seen"])
-        update_cache(CompensationState(cache, nothing, nothing), counted, low, self.compensation)
-        added = CompensatedGradient(cache * low[:, None], low, 0.0, to_sum=self.compensation.target == "sum")
+        memory = CompensationState(cache, nothing, nothing)
+        added = close_cycle(memory, counted, low, threshold, DensifyConfig(), self.compensation)
         return plain + added.per_draw(state["count"][:, None])[:, 0]
 
     def _grow(self, params: Params, optimizers: Optimizers, state: dict[str, Any]) -> int:

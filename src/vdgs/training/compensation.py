@@ -3,8 +3,7 @@
 Dimensions: n anchors, k offsets. At the end of a growth cycle (between two growth decisions), `densify` calls:
 
     low, threshold = low_visibility_mask(ratio, config)                      # eq. 8's c_k -> the set L, eq. 9
-    update_cache(compensation, statistics, low, config)                      # g_k, eq. 10
-    compensated = compensate(compensation, low, threshold, growth, config)
+    compensated = close_cycle(compensation, statistics, low, threshold, growth, config)     # g_k, eq. 10
     decide_densification(..., compensated=compensated)                       # grows; resets what was judged
     begin_cycle(compensation, statistics)                                    # the next cycle counts from here
 
@@ -100,6 +99,26 @@ def update_cache(
     fed = cycle_gradient(compensation, statistics).mul_(config.beta_g).mul_(low[:, None])
     # Two operations: one fused multiply-add would round differently where vector and remainder code differ.
     compensation.cache.mul_(config.gamma).add_(fed)
+
+
+def close_cycle(
+    compensation: CompensationState,
+    statistics: DensificationStats,
+    low: Bool[Tensor, " n"],
+    threshold: float,
+    growth: DensifyConfig,
+    config: CompensationConfig,
+) -> CompensatedGradient:
+    """End of a cycle: `update_cache` and `compensate`, in the order of `config.history`.
+
+    `past`: what is added is g_k as the cycle before left it, 0 in the first cycle.
+    """
+    if config.history == "past":
+        added = compensate(compensation, low, threshold, growth, config)
+        update_cache(compensation, statistics, low, config)
+        return added
+    update_cache(compensation, statistics, low, config)
+    return compensate(compensation, low, threshold, growth, config)
 
 
 def compensate(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vdgs.kernels import get_backend
 from vdgs.kernels.idle_memory import trim_heap
-from vdgs.training.compensation import begin_cycle, compensate, cycle_log, low_visibility_mask, update_cache
+from vdgs.training.compensation import begin_cycle, close_cycle, cycle_log, low_visibility_mask
 from vdgs.training.densification import CompensatedGradient, decide_densification
 from vdgs.training.per_anchor_tensors import index_anchors
 from vdgs.training.schedule import views_in_cycle
@@ -60,8 +60,8 @@ def _compensate(state: TrainingState, stage: TrainingProblem) -> tuple[Compensat
     cameras = [stage.images.camera(view) for view in views_in_cycle(state.iteration, stage)]
     share = visibility_ratio(state.anchors.positions, cameras)
     low, threshold = low_visibility_mask(share, config.compensation)
-    update_cache(state.compensation, state.statistics, low, config.compensation)
-    return compensate(state.compensation, low, threshold, config.densify, config.compensation), share, threshold
+    closed = close_cycle(state.compensation, state.statistics, low, threshold, config.densify, config.compensation)
+    return closed, share, threshold
 
 
 def sort_morton(state: TrainingState) -> None:
