@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import struct
 from dataclasses import replace
@@ -281,6 +282,23 @@ def test_half_of_another_size_without_tags_are_photographs_and_masks_of_the_same
     assert len(collect_images([tmp_path / "a"]).images) == 2 * COUNT
     flight(tmp_path / "b")
     assert [photo.name for photo in collect_images([tmp_path / "b"]).images] == names
+
+
+@pytest.mark.parametrize("beside", ["JPG.json", "JPG.supplemental-metadata.json", "HEIC.json", "xmp"])
+def test_a_position_in_a_file_beside_a_stripped_photograph_takes_no_camera_from_it(tmp_path, beside):
+    """Its camera and lens are those of the others of its size, and of a size that no other has it is left out."""
+    names = flight(tmp_path)
+    for name, width in ((names[1], 160), (names[4], 160), ("DJI_0098.JPG", 200)):
+        picture(tmp_path / name, pixels(int(name[4:8]) + 50, width), quality=95)
+        place = json.dumps({"geoData": {"latitude": -33.5, "longitude": -70.6, "altitude": 540.0}})
+        if beside == "xmp":
+            place = '<rdf:Description exif:GPSLatitude="33,30.0S" exif:GPSLongitude="70,36.0W"/>'
+        (tmp_path / name).with_suffix(f".{beside}").write_text(place)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert len({(photo.camera, photo.lens) for photo in found.images}) == 1
+    assert all(photo.lat_lon for photo in found.images)
+    assert "has no tags of a camera, and 200 x 120 pixels" in found.excluded[0].reason
 
 
 def test_photographs_without_any_tags_are_photographs(tmp_path):

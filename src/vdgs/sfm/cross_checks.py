@@ -253,8 +253,9 @@ def _may_be_by(camera: str) -> str:
 
 
 def is_bare(photo: ImageMetadata) -> bool:
-    """Whether nothing says which camera took a picture, through what, and where."""
-    return photo.camera == UNKNOWN_CAMERA and photo.lens is None and photo.lat_lon is None
+    """Whether its own tags do not say which camera took a picture, through what, and where."""
+    placed = photo.lat_lon is not None and not photo.place_is_lent
+    return photo.camera == UNKNOWN_CAMERA and photo.lens is None and not placed
 
 
 def _other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:

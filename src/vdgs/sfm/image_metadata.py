@@ -184,6 +184,8 @@ class ImageMetadata:
     """Date and time as EXIF has them, 2026:06:23 16:31:59; empty where it says none."""
     lat_lon: tuple[float, float] | None
     """Latitude and longitude in degrees."""
+    place_is_lent: bool = False
+    """Whether a file beside it says that, not its own tags."""
     altitude: float | None
     altitude_type: str
     gps_std: tuple[float, float, float] | None
