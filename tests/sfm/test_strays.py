@@ -217,6 +217,28 @@ def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
     assert all(f"another version of z/{each.name[-12:]}" in each.reason for each in found.excluded)
 
 
+@pytest.mark.parametrize("name", ["{}-bearbeitet.jpg", "{}_HDR.jpg", "flight_{}_small.jpg"])
+@pytest.mark.parametrize("change", ["", "stripped", "another moment", "another picture"])
+def test_edited_versions_in_another_folder_under_another_name_are_left_out(tmp_path, name, change):
+    """By the name and the moment, or by what they show; not those of other flights, whose files count from 1, too."""
+    names = flight(tmp_path / "card")
+    for k, first in enumerate(names[:4]):
+        with Image.open(tmp_path / "card" / first) as image:
+            exif, shown = image.getexif(), (255 * (np.asarray(image) / 255) ** 0.7).astype(np.uint8)
+        if change.startswith("another"):
+            exif.get_ifd(0x8769)[0x9003] = f"2026:06:02 12:00:{k:02d}"
+        if change == "another picture":
+            shown = pixels(60 + k)
+        more = {} if change == "stripped" else {"exif": exif}
+        picture(tmp_path / "out" / name.format(first.removesuffix(".JPG")), shown, quality=92, **more)
+    found = collect_images([tmp_path])
+    named = not name.startswith("flight")
+    left_out = change == "" or (named and change != "another picture")
+    assert len(found.images) == COUNT + (0 if left_out else 4)
+    if left_out:
+        assert all("another version of card/DJI_" in each.reason for each in found.excluded)
+
+
 @pytest.mark.parametrize("counted", ["20260601_100000-1", "20260601_100000(0)", "20260601_100000_1"])
 @pytest.mark.parametrize("subseconds", [None, ("000", "500")])
 def test_photographs_of_one_second_are_no_copies_of_each_other(tmp_path, counted, subseconds):

@@ -188,7 +188,7 @@ class _Moments:
 
 def _like_others(photographs: Sequence[ImageMetadata], thermal: dict[str, str]) -> dict[str, str]:
     """Pictures with the name of a thermal one, of the camera and size of those that are left out for one."""
-    kinds = {(photo.camera, photo.size): photo.name for photo in photographs if photo.name in thermal}
+    kinds = {(photo.camera, photo.size): photo.name for photo in reversed(photographs) if photo.name in thermal}
     return {
         photo.name: f"is a thermal picture by its name, of the size of {like}: {_REMEDY}"
         for photo in photographs
