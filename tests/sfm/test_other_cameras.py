@@ -92,6 +92,7 @@ def test_what_the_maker_calls_thermal_is_left_out_whatever_its_name_and_size(tmp
         ("MAX_{:04d}.JPG", "IRX_{:04d}.JPG"),  # Autel
         ("DJI_{:04d}.JPG", "DJI_{:04d}_R.JPG"),  # DJI's XT2
         ("visible/a{:04d}.JPG", "thermal/b{:04d}.JPG"),
+        ("rgb/a{:04d}.JPG", "ir/DCIM/100MEDIA/b{:04d}.JPG"),
         ("p{:04d}.JPG", "p{:04d}_IR.JPG"),
         ("DJI_{:04d}.JPG", "DJI_{:04d}_T.JPG"),
     ],
@@ -102,13 +103,13 @@ def test_what_its_name_calls_thermal_is_left_out_where_it_has_the_size_of_its_se
 ):
     """At any moment; and used where all are thermal."""
     names = [thermal.format(k) for k in range(COUNT)]
-    (tmp_path / names[0]).parent.mkdir(exist_ok=True)
+    (tmp_path / names[0]).parent.mkdir(parents=True, exist_ok=True)
     cold = shoot(tmp_path, names, 50, THERMAL, late_s=1800)
     if not together:
         assert len(collect_images([tmp_path]).images) == COUNT
         return
     names = [visible.format(k) for k in range(COUNT)]
-    (tmp_path / names[0]).parent.mkdir(exist_ok=True)
+    (tmp_path / names[0]).parent.mkdir(parents=True, exist_ok=True)
     only_thermal_are_left_out(tmp_path, shoot(tmp_path, names), cold, "by its name and size (320 x 256)")
 
 

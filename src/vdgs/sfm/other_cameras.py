@@ -23,6 +23,8 @@ _THERMAL_WORD = re.compile(
 )
 #: What makers put behind the names of them (DJI's XT2: DJI_0001_R beside DJI_0001).
 _THERMAL_TAIL = re.compile(r".*_[RT](?:_.*)?", re.IGNORECASE)
+#: Folders of memory cards, below which a person's own are.
+_CARD_FOLDER = re.compile(r"DCIM|\d{3}[A-Z_]\w*", re.IGNORECASE)
 #: Sizes of thermal sensors, and those that makers enlarge them to (pixels).
 _THERMAL_SIZES = {
     (160, 120), (206, 156), (240, 180), (320, 240), (320, 256), (336, 256), (384, 288), (464, 348), (640, 480),
@@ -114,7 +116,8 @@ def _has_thermal_size(photo: ImageMetadata) -> bool:
 def _has_thermal_word(photo: ImageMetadata) -> bool:
     """In its own name, or in that of its folder."""
     path = PurePosixPath(photo.name)
-    return any(_THERMAL_WORD.search(part) for part in (path.stem, path.parent.name))
+    folders = [part for part in path.parent.parts if not _CARD_FOLDER.fullmatch(part)]
+    return any(_THERMAL_WORD.search(part) for part in (path.stem, *folders[-1:]))
 
 
 def _by_name(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
