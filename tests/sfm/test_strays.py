@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import struct
 from dataclasses import replace
@@ -216,6 +217,28 @@ def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
     assert all(f"another version of z/{each.name[-12:]}" in each.reason for each in found.excluded)
 
 
+@pytest.mark.parametrize("name", ["{}-bearbeitet.jpg", "{}_HDR.jpg", "flight_{}_small.jpg"])
+@pytest.mark.parametrize("change", ["", "stripped", "another moment", "another picture"])
+def test_edited_versions_in_another_folder_under_another_name_are_left_out(tmp_path, name, change):
+    """By the name and the moment, or by what they show; not those of other flights, whose files count from 1, too."""
+    names = flight(tmp_path / "card")
+    for k, first in enumerate(names[:4]):
+        with Image.open(tmp_path / "card" / first) as image:
+            exif, shown = image.getexif(), (255 * (np.asarray(image) / 255) ** 0.7).astype(np.uint8)
+        if change.startswith("another"):
+            exif.get_ifd(0x8769)[0x9003] = f"2026:06:02 12:00:{k:02d}"
+        if change == "another picture":
+            shown = pixels(60 + k)
+        more = {} if change == "stripped" else {"exif": exif}
+        picture(tmp_path / "out" / name.format(first.removesuffix(".JPG")), shown, quality=92, **more)
+    found = collect_images([tmp_path])
+    named = not name.startswith("flight")
+    left_out = change == "" or (named and change != "another picture")
+    assert len(found.images) == COUNT + (0 if left_out else 4)
+    if left_out:
+        assert all("another version of card/DJI_" in each.reason for each in found.excluded)
+
+
 @pytest.mark.parametrize("counted", ["20260601_100000-1", "20260601_100000(0)", "20260601_100000_1"])
 @pytest.mark.parametrize("subseconds", [None, ("000", "500")])
 def test_photographs_of_one_second_are_no_copies_of_each_other(tmp_path, counted, subseconds):
@@ -281,6 +304,23 @@ def test_half_of_another_size_without_tags_are_photographs_and_masks_of_the_same
     assert len(collect_images([tmp_path / "a"]).images) == 2 * COUNT
     flight(tmp_path / "b")
     assert [photo.name for photo in collect_images([tmp_path / "b"]).images] == names
+
+
+@pytest.mark.parametrize("beside", ["JPG.json", "JPG.supplemental-metadata.json", "HEIC.json", "xmp"])
+def test_a_position_in_a_file_beside_a_stripped_photograph_takes_no_camera_from_it(tmp_path, beside):
+    """Its camera and lens are those of the others of its size, and of a size that no other has it is left out."""
+    names = flight(tmp_path)
+    for name, width in ((names[1], 160), (names[4], 160), ("DJI_0098.JPG", 200)):
+        picture(tmp_path / name, pixels(int(name[4:8]) + 50, width), quality=95)
+        place = json.dumps({"geoData": {"latitude": -33.5, "longitude": -70.6, "altitude": 540.0}})
+        if beside == "xmp":
+            place = '<rdf:Description exif:GPSLatitude="33,30.0S" exif:GPSLongitude="70,36.0W"/>'
+        (tmp_path / name).with_suffix(f".{beside}").write_text(place)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert len({(photo.camera, photo.lens) for photo in found.images}) == 1
+    assert all(photo.lat_lon for photo in found.images)
+    assert "has no tags of a camera, and 200 x 120 pixels" in found.excluded[0].reason
 
 
 def test_photographs_without_any_tags_are_photographs(tmp_path):

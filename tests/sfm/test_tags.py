@@ -244,6 +244,8 @@ def test_cut_photographs_have_the_focal_length_of_the_others_in_pixels_and_copie
     copy = replace(seen[0], name="p00 (1).jpg")
     assert list(strays([*seen, copy, replace(copy, name="p00-edited.jpg")])[0]) == ["p00 (1).jpg", "p00-edited.jpg"]
     assert strays([*seen, replace(copy, datetime="2026:06:02 10:00:00")])[0] == {}  # of another moment
+    edited = [replace(copy, name=f"p00{tail}.jpg") for tail in ("-modifié", "-ha editado", "_HDR", "-edited(1)")]
+    assert [*strays([*seen, *edited])[0]] == [photo.name for photo in edited]
     phone = replace(seen[0], name="a/IMG_0001.HEIC"), replace(seen[0], name="a/IMG_E0001.JPG")
     assert list(strays(phone)[0]) == ["a/IMG_E0001.JPG"]
     enhanced = [replace(seen[0], name=name) for name in ("p.dng", "p-Enhanced-NR.dng", "p-HDR.jpg")]

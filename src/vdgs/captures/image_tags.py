@@ -21,6 +21,10 @@ _BITS_PER_SAMPLE = 0x0102
 #: of libtiff has. Of others COLMAP finds nothing, or reads black.
 _COMMON_FORMATS = ("JPEG", "MPO", "PNG", "BMP", "TIFF")
 _COMMON_COMPRESSIONS = ("raw", "packbits", "tiff_lzw", "tiff_deflate", "tiff_adobe_deflate", "jpeg")
+#: What radiometric JPEGs keep temperatures in: FLIR's segments, and the parameters of DJI's by their first bytes, or
+#: those behind a head.
+_FLIR, _DJI, _DJI_BEHIND = b"FLIR\0", b"\xaa\x55\x12\x06", b"\xaa\x55\x38\x00"
+_DJI_HEAD_BYTES = 32
 _NAMES = {"HEIF": "HEIC", "WEBP": "WebP"}
 
 
@@ -44,6 +48,8 @@ class ImageTags:
     kind: str
     """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, WebP, raw, CMYK, Display P3, 16 bits
     a channel; empty for what is."""
+    has_temperatures: bool = False
+    """Whether it is a radiometric JPEG of a thermal camera."""
 
 
 def read_tags(path: Path) -> ImageTags:
@@ -70,6 +76,7 @@ def read_tags(path: Path) -> ImageTags:
             has_alpha_channel="A" in image.getbands() or "transparency" in image.info,
             whole=image.format not in JPEGS or has_end(path, image),
             kind=kind,
+            has_temperatures=_has_temperatures(image),
         )
 
 
@@ -85,6 +92,15 @@ def _kind(image: Image.Image) -> str:
     space = foreign_space(image)
     colors = space or ("16 bits a channel" if _has_16_bits(image) else "")
     return ", ".join(filter(None, (_uncommon_format(image), colors)))
+
+
+def _has_temperatures(image: Image.Image) -> bool:
+    segments = [(marker, bytes(content[: _DJI_HEAD_BYTES + 4])) for marker, content in getattr(image, "applist", ())]
+    return any(
+        (marker == "APP1" and head.startswith(_FLIR))
+        or (marker == "APP4" and (head.startswith(_DJI) or head[_DJI_HEAD_BYTES:] == _DJI_BEHIND))
+        for marker, head in segments
+    )
 
 
 def _uncommon_format(image: Image.Image) -> str:

@@ -29,6 +29,7 @@ from vdgs.sfm.exif_gps import (
 from vdgs.sfm.focal_length import Lens, read_lens
 from vdgs.sfm.map_datums import to_wgs84
 from vdgs.sfm.spectral_bands import band_of
+from vdgs.sfm.thermal_signs import thermal_sign
 from vdgs.sfm.xmp import first_number, read_xmp, text
 from vdgs.system.permissions import refusal
 
@@ -184,6 +185,8 @@ class ImageMetadata:
     """Date and time as EXIF has them, 2026:06:23 16:31:59; empty where it says none."""
     lat_lon: tuple[float, float] | None
     """Latitude and longitude in degrees."""
+    place_is_lent: bool = False
+    """Whether a file beside it says that, not its own tags."""
     altitude: float | None
     altitude_type: str
     gps_std: tuple[float, float, float] | None
@@ -231,8 +234,16 @@ class ImageMetadata:
     """The part of the second of `datetime`, where EXIF says it (SubSecTimeOriginal)."""
     attitudes: Mapping[str, Attitude] = field(default_factory=dict, hash=False)
     """By all readings of the recorded angles (`BODY`, ...), where their names leave several open."""
+    thermal: str = ""
+    """What its maker says that tells a thermal picture; empty for color, and where nothing does."""
     frame: str = ""
     """What was taken at one moment: the name of the panorama, or of the photograph itself."""
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether its own tags do not say which camera took it, through what, and where."""
+        placed = self.lat_lon is not None and not self.place_is_lent
+        return self.camera == UNKNOWN_CAMERA and self.lens is None and not placed
 
     @property
     def may_be_masked(self) -> bool:
@@ -337,6 +348,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         is_panorama=panorama,
         exposure_bias=finite(details.get(0x9204)),
         exposure_stops=_exposure_stops(details),
+        thermal=thermal_sign(found, xmp),
         frame=name,
     )
 

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from vdgs.captures.image_suffixes import AVIF_SUFFIXES, HEIF_SUFFIXES, IMAGE_SUFFIXES
+from vdgs.sfm.edited_names import EDITED_WORDS
 from vdgs.sfm.exif_gps import finite, read_altitude, read_place
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.xmp import read_xmp
 
 #: Google Takeout cuts names at so many letters, before the number of a double and `.json`.
 _TAKEOUT_LETTERS = 46
-_DOUBLE = re.compile(r"(.*?)(?:-edited)?(\(\d+\))?")
+_DOUBLE = re.compile(rf"(.*?)(?:-(?:{EDITED_WORDS}))?(\(\d+\))?", re.IGNORECASE)
+#: What Google Photos keeps under a name of which a photograph may have been converted.
+_CONVERTED = HEIF_SUFFIXES | AVIF_SUFFIXES | IMAGE_SUFFIXES | {".dng"}
 #: Larger files are none (bytes).
 _LARGEST = 1 << 20
 
@@ -37,7 +42,7 @@ def with_sidecars(photo: ImageMetadata) -> ImageMetadata:
             kind = f"{file.suffix} of Google Takeout as recorded, datum not stated"
             return replace(
                 photo, lat_lon=(latitude, longitude), altitude=altitude or None, altitude_type=kind,
-                datetime=photo.datetime or _moment(content), doubts=(*photo.doubts, _beside(file)),
+                place_is_lent=True, datetime=photo.datetime or _moment(content), doubts=(*photo.doubts, _beside(file)),
             )  # fmt: skip
     for file in (photo.path.with_suffix(".xmp"), photo.path.with_name(f"{photo.path.name}.xmp")):
         if file.is_file() and file.stat().st_size < _LARGEST:
@@ -46,7 +51,9 @@ def with_sidecars(photo: ImageMetadata) -> ImageMetadata:
             if position is not None:
                 altitude, kind = read_altitude({}, xmp)
                 doubts = (*photo.doubts, _beside(file))
-                return replace(photo, lat_lon=position, altitude=altitude, altitude_type=kind, doubts=doubts)
+                return replace(
+                    photo, lat_lon=position, altitude=altitude, altitude_type=kind, place_is_lent=True, doubts=doubts
+                )
     return photo
 
 
@@ -56,9 +63,18 @@ def _beside(file: Path) -> str:
 
 def _takeout_names(path: Path) -> list[Path]:
     """What Takeout calls the JSON of a photograph, today and until 2024."""
-    match = _DOUBLE.fullmatch(path.stem)
+    own = _json_names(path, path.suffix)
+    if any(file.is_file() for file in own):
+        return own
+    # Of another ending: of a photograph that was converted.
+    endings = [each for suffix in sorted(_CONVERTED) for each in (suffix, suffix.upper())]
+    return [file for ending in endings for file in _json_names(path, ending)]
+
+
+def _json_names(path: Path, suffix: str) -> list[Path]:
+    match = _DOUBLE.fullmatch(unicodedata.normalize("NFC", path.stem))
     stem, double = (match[1], match[2] or "") if match else (path.stem, "")
-    name = f"{stem}{path.suffix}"
+    name = f"{stem}{suffix}"
     whole = (f"{name}.supplemental-metadata", name)
     return [path.with_name(f"{each[:_TAKEOUT_LETTERS]}{double}.json") for each in whole]
 

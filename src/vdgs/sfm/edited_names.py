@@ -1,0 +1,34 @@
+"""How systems and programs name copies and edited versions of photographs."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+#: What Google Photos puts behind the name of what was edited, in the languages of its users; for regular expressions.
+EDITED_WORDS = "|".join(
+    (
+        "edited", "bearbeitet", "modifié", "(?:ha[ _])?editado", "editada", "editat", "modificato", "modificata",
+        "bewerkt", "edytowane", "redigerad", "redigeret", "redigert", "muokattu", "upraveno", "upravené",
+        "szerkesztett", "szerkesztve", "editată", "düzenlendi", "изменено", "змінено", "編集済み", "已编辑", "编辑",
+        "已編輯", "수정됨",
+    )
+)  # fmt: skip
+_COPY_NAME = re.compile(
+    r"(?P<first>.+?)(?:[ _-]+(?:copy|copie|kopie|copia)(?:[ _]?\(?\d{1,2}\)?)?"
+    rf"|[-_~](?:{EDITED_WORDS}|edit|hdr|enhanced(?:-(?:nr|sr|rd)){{0,3}})(?P<double>\(\d{{1,2}}\))?)",
+    re.IGNORECASE,
+)
+#: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
+_EDITED_ON_PHONE = re.compile(r"(.*\bIMG_)E(\d{4})", re.IGNORECASE)
+
+
+def first_stems(stem: str) -> list[str]:
+    """What the photograph may be called, in lower case and without an ending, of which one of this stem is a copy or an
+    edited version; none for other stems."""
+    stem = unicodedata.normalize("NFC", stem)
+    if match := _EDITED_ON_PHONE.fullmatch(stem):
+        return ["".join(match.groups()).lower()]
+    if match := _COPY_NAME.fullmatch(stem):
+        return list(dict.fromkeys((f"{match['first']}{match['double'] or ''}".lower(), match["first"].lower())))
+    return []

@@ -1,0 +1,215 @@
+"""Which photographs are copies, previews or edited versions of others."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from vdgs.captures.image_files import open_image, same_aspect
+from vdgs.sfm.brackets import SAME_STOPS
+from vdgs.sfm.edited_names import first_stems
+from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.rig_folders import may_be_sensor
+
+#: A smaller copy has at most this share of the longer side of the photograph of its name.
+SMALLER = 0.7
+#: How systems count what they download again, and how cameras count photographs of one second.
+_COUNTED_NAME = re.compile(r"(.+?)(?:[ _]?\(\d{1,2}\)|[-_~]\d)")
+#: Programs may cut off the digits of parts of a second behind the second one.
+_SAME_SUBSECOND = 0.01
+#: Programs that convert photographs may round places by so much (about a metre; choice).
+_ROUNDED_DEG = 1e-5
+#: Photographs show the same where the order of the gray values of their pixels correlates so well, by so many of them
+#: (choice; five aerial photographs and themselves moved by 2 % of the width: 0.54 to 0.92).
+SAME_PICTURE, LOOKED_AT_PAIRS = 0.95, 3
+#: Sides of the small picture that tells it.
+_LOOKED_AT = (128, 128)
+
+Folder = Mapping[str, ImageMetadata]
+
+
+def versions(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Photographs of which another version is among the others, with the reason."""
+    reasons = _smaller_copies(photographs) | _later_copies(photographs)
+    return reasons | _versions_elsewhere([photo for photo in photographs if photo.name not in reasons])
+
+
+def taken_apart(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether two photographs were taken at other moments or places, as far as both say it."""
+    moments = photo.datetime, other.datetime
+    apart = all(moments) and (moments[0] != moments[1] or _are_of_other_parts(photo, other))
+    return apart or _are_of_other_places(photo, other)
+
+
+def _are_of_other_parts(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether both say the part of their second, and these differ."""
+    if photo.subsecond is None or other.subsecond is None:
+        return False
+    return abs(photo.subsecond - other.subsecond) >= _SAME_SUBSECOND
+
+
+def _are_of_other_places(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    if photo.lat_lon is None or other.lat_lon is None:
+        return False
+    return bool(np.abs(np.subtract(photo.lat_lon, other.lat_lon)).max() > _ROUNDED_DEG)
+
+
+def _is_copy(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether two photographs of one name and shape are one. Programs rewrite dates: where those alone differ, what the
+    photographs show tells."""
+    if _are_of_other_places(photo, other):
+        return False
+    return not taken_apart(photo, other) or _show_the_same([(photo, other)])
+
+
+def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder, and not of another
+    flight, whose files count from 1 again."""
+    stems: dict[str, list[ImageMetadata]] = {}
+    for photo in photographs:
+        stems.setdefault(PurePosixPath(photo.name).stem.lower(), []).append(photo)
+    usual = Counter(photo.size for photo in photographs).most_common(1)[0][0] if photographs else (0, 0)
+    reasons = {}
+    for alike in stems.values():
+        for photo in alike:
+            larger = [
+                other
+                for other in alike
+                if max(photo.size) <= SMALLER * max(other.size)
+                and same_aspect(photo.size, other.size)
+                and _is_copy(photo, other)
+            ]
+            if larger and photo.size != usual:
+                largest = max(larger, key=lambda other: other.width * other.height)
+                reasons[photo.name] = f"is a smaller copy of {largest.name}"
+    return reasons
+
+
+def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Photographs that were edited, merged or downloaded twice, where the first is there, which they are named after,
+    in any folder those whose name says so. A name that merely counts may be that of the next photograph of the same
+    second: there both must show the same."""
+    stems: dict[str, list[ImageMetadata]] = {}
+    for photo in photographs:
+        stem = unicodedata.normalize("NFC", PurePosixPath(photo.name).stem)
+        stems.setdefault(stem.lower(), []).append(photo)
+    found = {}
+    for photo in photographs:
+        path = PurePosixPath(photo.name)
+        edited = first_stems(path.stem)
+        counted = None if edited else _COUNTED_NAME.fullmatch(path.stem)
+        named = [first for stem in edited for first in stems.get(stem, ())]
+        named += stems.get(counted[1].lower(), []) if counted else []
+        named.sort(key=lambda first: PurePosixPath(first.name).parent != path.parent)
+        for first in named:
+            beside = PurePosixPath(first.name).parent == path.parent
+            if (edited or beside) and (why := _why_version(photo, first, bool(edited))):
+                found[photo.name] = f"is a copy or another version of {first.name}, by {why}"
+                break
+    return found
+
+
+def _why_version(photo: ImageMetadata, first: ImageMetadata, edited: bool) -> str:
+    """What says that a photograph is a version of the one that it is named after; empty for nothing. Programs that edit
+    may drop or rewrite tags."""
+    shown = "its name, moment, place and what it shows"
+    if not edited:
+        known = bool(photo.datetime) and photo.camera == first.camera
+        known &= (photo.datetime, photo.lat_lon) == (first.datetime, first.lat_lon) and not taken_apart(photo, first)
+        return shown if known and _show_the_same([(first, photo)]) else ""
+    if photo.camera != first.camera and not photo.is_bare:
+        return ""
+    if photo.datetime and first.datetime and not taken_apart(photo, first):
+        return "its name, moment and place"
+    seen = not _are_of_other_places(photo, first) and _show_the_same([(first, photo)])
+    return "its name and what it shows" if seen else ""
+
+
+def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Photographs that another folder has too, edited or as raw files: of one name, or of a camera and a moment that no
+    other of their folder has; of one moment, place and shape, and they show the same. The folder of more photographs is
+    used. Folders of the cameras of a rig are not compared with each other: they share names, moments and places, and
+    may show nearly the same."""
+    folders: dict[str, dict[str, ImageMetadata]] = {}
+    for photo in photographs:
+        path = PurePosixPath(photo.name)
+        folders.setdefault(str(path.parent), {})[path.stem.lower()] = photo
+    found, kept = dict[str, str](), list[tuple[str, dict[str, ImageMetadata]]]()
+    for folder in sorted(folders, key=lambda each: (_are_raw(folders[each]), -len(folders[each]), len(each), each)):
+        for name, other in kept:
+            if may_be_sensor(folder) and may_be_sensor(name):
+                continue
+            for pairs, how in ((_of_one_name, "name, moment, place"), (_of_one_moment, "camera, moment, place")):
+                alike = [
+                    (one, photo)
+                    for one, photo in pairs(other, folders[folder])
+                    if one.name not in found and photo.name not in found and _is_one_exposure(one, photo)
+                ]
+                if alike and _show_the_same(alike):
+                    for one, photo in alike:
+                        found[photo.name] = f"is another version of {one.name}, by its {how} and what it shows"
+        kept.append((folder, folders[folder]))
+    return found
+
+
+def _of_one_name(one: Folder, other: Folder) -> list[tuple[ImageMetadata, ImageMetadata]]:
+    return [(one[stem], other[stem]) for stem in sorted(one.keys() & other.keys())]
+
+
+def _of_one_moment(one: Folder, other: Folder) -> list[tuple[ImageMetadata, ImageMetadata]]:
+    """The photographs of two folders by one camera of a moment at which it took no others of theirs."""
+    moments, others = _by_moment(one), _by_moment(other)
+    return [(moments[when], others[when]) for when in sorted(moments.keys() & others.keys())]
+
+
+def _by_moment(folder: Folder) -> dict[tuple[str, str, float], ImageMetadata]:
+    found: dict[tuple[str, str, float], list[ImageMetadata]] = {}
+    for photo in folder.values():
+        if photo.datetime and not photo.is_bare:
+            found.setdefault((photo.datetime, photo.camera, photo.subsecond or 0.0), []).append(photo)
+    return {when: taken[0] for when, taken in found.items() if len(taken) == 1}
+
+
+def _are_raw(folder: Folder) -> bool:
+    return all(photo.kind == "raw" for photo in folder.values())
+
+
+def _is_one_exposure(one: ImageMetadata, other: ImageMetadata) -> bool:
+    known = bool(one.datetime and other.datetime) and not taken_apart(one, other)
+    stops = one.exposure_stops, other.exposure_stops
+    if stops[0] is not None and stops[1] is not None:  # of a bracket whose exposures were sorted into folders?
+        known &= abs(stops[0] - stops[1]) < SAME_STOPS
+    return known and ("raw" in (one.kind, other.kind) or same_aspect(one.size, other.size))
+
+
+def _show_the_same(pairs: Sequence[tuple[ImageMetadata, ImageMetadata]]) -> bool:
+    """Whether the photographs of each pair show the same in any brightness and contrast, by a few of them. A raw file
+    and a picture of one exposure do."""
+    chosen = [pairs[k] for k in sorted({len(pairs) * part // LOOKED_AT_PAIRS for part in range(LOOKED_AT_PAIRS)})]
+    for one, other in chosen:
+        if (one.kind == "raw") == (other.kind == "raw"):
+            ranks = _gray_ranks(one), _gray_ranks(other)
+            if not all(np.any(each) for each in ranks) or np.corrcoef(ranks)[0, 1] < SAME_PICTURE:
+                return False
+    return True
+
+
+def _gray_ranks(photo: ImageMetadata) -> np.ndarray:
+    """Which place each pixel [n] of a small upright picture has by its brightness, from the middle one; zeros for a
+    picture of one gray value, and for one that Pillow does not read."""
+    try:
+        with open_image(photo.path) as image:
+            image.draft("L", (2 * _LOOKED_AT[0], 2 * _LOOKED_AT[1]))
+            small = ImageOps.exif_transpose(image).convert("L").resize(_LOOKED_AT, Image.Resampling.BOX)
+            gray = np.asarray(small).ravel()
+    except (OSError, SyntaxError, ValueError):
+        return np.zeros(_LOOKED_AT[0] * _LOOKED_AT[1])
+    ordered = np.sort(gray)
+    ranks = np.searchsorted(ordered, gray) + np.searchsorted(ordered, gray, side="right")
+    return np.asarray(ranks - ranks.mean())

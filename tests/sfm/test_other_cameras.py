@@ -1,0 +1,155 @@
+"""Thermal pictures among photographs: left out where the maker says so, or the name and a second sign do."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from support.flights import add_xmp, write_photograph
+from vdgs.sfm.image_list import ImageList, collect_images
+
+COUNT, SIZE, THERMAL = 5, (400, 300), (320, 256)
+
+
+def pixels(number: int, width: int, height: int) -> np.ndarray:
+    rough = np.random.default_rng(number).integers(0, 255, (height // 4, width // 4, 3), np.uint8)
+    return cv2.resize(rough, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def shoot(
+    folder: Path,
+    names: list[str],
+    number: int = 0,
+    size: tuple[int, int] = SIZE,
+    late_s: int = 0,
+    focal_mm: float = 8.5,
+) -> list[Path]:
+    """Photographs a few seconds after each other."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, name in enumerate(names):
+        shown = pixels(number + k, *size)
+        place = np.array([10.0 * k, 0.0, 40.0])
+        write_photograph(folder / name, shown, 5 * k + late_s, place, focal_mm=focal_mm)
+    return [folder / name for name in names]
+
+
+def rename_model(file: Path, model: str) -> None:
+    with Image.open(file) as image:
+        exif, shown = image.getexif(), np.asarray(image)
+    exif[0x0110] = model
+    Image.fromarray(shown).save(file, exif=exif, quality=95)
+
+
+def add_segment(file: Path, marker: int, content: bytes) -> None:
+    data = file.read_bytes()
+    file.write_bytes(data[:2] + struct.pack(">BBH", 0xFF, marker, len(content) + 2) + content + data[2:])
+
+
+def used(found: ImageList) -> list[str]:
+    return [photo.name for photo in found.images]
+
+
+def only_thermal_are_left_out(folder: Path, visible: list[Path], thermal: list[Path], why: str) -> None:
+    found = collect_images([folder])
+    assert used(found) == sorted(str(file.relative_to(folder)) for file in visible)
+    assert {each.name for each in found.excluded} == {str(file.relative_to(folder)) for file in thermal}
+    assert all(why in each.reason and "give a folder of those alone" in each.reason for each in found.excluded)
+
+
+@pytest.mark.parametrize("sign", ["ImageSource", "BandName", "XT", "FLIR", "DJI", "DJI behind a head"])
+@pytest.mark.parametrize("together", [True, False])
+def test_what_the_maker_calls_thermal_is_left_out_whatever_its_name_and_size(tmp_path, sign, together):
+    """And used where all are thermal."""
+    visible = shoot(tmp_path, [f"DJI_{2 * k:04d}.JPG" for k in range(COUNT)]) if together else []
+    thermal = shoot(tmp_path, [f"DJI_{2 * k + 1:04d}.JPG" for k in range(COUNT)], 50, (300, 210))
+    for file in visible:
+        add_xmp(file, b'<rdf:Description drone-dji:ImageSource="WideCamera" Camera:BandName="NIR, Near infrared"/>')
+    for file in thermal:
+        if sign == "ImageSource":
+            add_xmp(file, b'<rdf:Description drone-dji:ImageSource="InfraredCamera"/>')
+        elif sign == "BandName":
+            add_xmp(file, b'<rdf:Description Camera:BandName="LWIR"/>')
+        elif sign == "XT":
+            rename_model(file, "XT")
+        elif sign == "FLIR":
+            add_segment(file, 0xE1, b"FLIR\0\1\0\0" + bytes(40))
+        else:
+            add_segment(file, 0xE4, b"\xaa\x55\x12\x06" if sign == "DJI" else bytes(32) + b"\xaa\x55\x38\x00")
+    if together:
+        only_thermal_are_left_out(tmp_path, visible, thermal, "is a thermal picture (")
+    else:
+        assert len(collect_images([tmp_path]).images) == COUNT
+
+
+@pytest.mark.parametrize(
+    ("visible", "thermal"),
+    [
+        ("MAX_{:04d}.JPG", "IRX_{:04d}.JPG"),  # Autel
+        ("DJI_{:04d}.JPG", "DJI_{:04d}_R.JPG"),  # DJI's XT2
+        ("visible/a{:04d}.JPG", "thermal/b{:04d}.JPG"),
+        ("rgb/a{:04d}.JPG", "ir/DCIM/100MEDIA/b{:04d}.JPG"),
+        ("p{:04d}.JPG", "p{:04d}_IR.JPG"),
+        ("DJI_{:04d}.JPG", "DJI_{:04d}_T.JPG"),
+    ],
+)
+@pytest.mark.parametrize("together", [True, False])
+def test_what_its_name_calls_thermal_is_left_out_where_it_has_the_size_of_its_sensor(
+    tmp_path, visible, thermal, together
+):
+    """At any moment; and used where all are thermal."""
+    names = [thermal.format(k) for k in range(COUNT)]
+    (tmp_path / names[0]).parent.mkdir(parents=True, exist_ok=True)
+    cold = shoot(tmp_path, names, 50, THERMAL, late_s=1800)
+    if not together:
+        assert len(collect_images([tmp_path]).images) == COUNT
+        return
+    names = [visible.format(k) for k in range(COUNT)]
+    (tmp_path / names[0]).parent.mkdir(parents=True, exist_ok=True)
+    only_thermal_are_left_out(tmp_path, shoot(tmp_path, names), cold, "by its name and size (320 x 256)")
+
+
+@pytest.mark.parametrize("late_s", [1, 1800])
+def test_what_its_folder_calls_thermal_is_left_out_beside_a_larger_photograph_of_its_moment(tmp_path, late_s):
+    """A name alone is no sign."""
+    visible = shoot(tmp_path / "rgb", [f"a{k}.JPG" for k in range(COUNT)])
+    thermal = shoot(tmp_path / "infrared", [f"b{k}.JPG" for k in range(COUNT)], 50, (300, 210), late_s)
+    if late_s > 2:
+        assert len(collect_images([tmp_path]).images) == 2 * COUNT
+    else:
+        only_thermal_are_left_out(tmp_path, visible, thermal, "by its name, and rgb/a")
+
+
+@pytest.mark.parametrize("size", [(160, 120), SIZE])
+@pytest.mark.parametrize("name", ["DJI_{:04d}_R.JPG", "FLIRTATION_{:04d}.JPG", "IRIS_{:04d}.JPG"])
+def test_photographs_that_only_their_names_could_call_thermal_are_used(tmp_path, name, size):
+    """As right ones of a pair, and those of a size like the others'."""
+    shoot(tmp_path, [name.format(k) for k in range(COUNT)], 0, size, late_s=600)
+    shoot(tmp_path, [f"p{k}.JPG" for k in range(COUNT)], 50, size)
+    assert len(collect_images([tmp_path]).images) == 2 * COUNT
+
+
+@pytest.mark.parametrize("folders", [("", ""), ("visible/", "other/")])
+def test_djis_thermal_pictures_are_left_out_across_folders_and_without_a_partner(tmp_path, folders):
+    stems = [f"DJI_2024032912000{k}_{k + 1:04d}" for k in range(COUNT)]
+    visible = shoot(tmp_path / folders[0], [f"{stem}_W.JPG" for stem in stems[:-1]])
+    thermal = shoot(tmp_path / folders[1], [f"{stem}_T.JPG" for stem in stems], 50, (300, 210))
+    only_thermal_are_left_out(tmp_path, visible, thermal, "thermal picture")
+    assert f"of the size of {folders[1]}{stems[0]}_T" in collect_images([tmp_path]).excluded[-1].reason
+
+
+@pytest.mark.parametrize(("focal_mm", "late_s"), [(20.0, 1), (8.5, 1), (20.0, 1800)])
+def test_pictures_of_the_size_of_a_thermal_sensor_need_a_longer_lens_and_a_photograph_of_their_moment(
+    tmp_path, focal_mm, late_s
+):
+    """As DJI's Mavic 2 Enterprise counts both in one row."""
+    visible = shoot(tmp_path, [f"DJI_{2 * k:04d}.JPG" for k in range(COUNT)])
+    thermal = shoot(tmp_path, [f"DJI_{2 * k + 1:04d}.JPG" for k in range(COUNT)], 50, THERMAL, late_s, focal_mm)
+    if (focal_mm, late_s) == (20.0, 1):
+        only_thermal_are_left_out(tmp_path, visible, thermal, "by its size (320 x 256), its longer lens and its moment")
+    else:
+        assert len(collect_images([tmp_path]).images) == 2 * COUNT
