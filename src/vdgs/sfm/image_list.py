@@ -18,12 +18,13 @@ from vdgs.captures.strays import check_no_run, walk
 from vdgs.config.sfm_options import Brackets, CameraModel
 from vdgs.errors import CaptureError
 from vdgs.sfm.brackets import unused_exposures
-from vdgs.sfm.cross_checks import cross_checked, strays, taken_apart, unused_bands
+from vdgs.sfm.cross_checks import cross_checked, strays, taken_apart
 from vdgs.sfm.find_images import check_decoders, find_files, is_dangling, is_film, is_photograph, nothing_found
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.rig_folders import with_sensors
 from vdgs.sfm.sidecars import with_sidecars
+from vdgs.sfm.used_bands import unused_bands
 from vdgs.system.content_digests import find_copies
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
