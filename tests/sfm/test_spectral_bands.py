@@ -136,3 +136,26 @@ def test_of_a_tiff_of_five_channels_it_is_said_what_it_is(tmp_path):
                 file.write(noise(k)[..., band % 3].astype(np.uint16) * 257, band + 1)
     with pytest.raises(CaptureError, match=r"0\.tif: is a TIFF of 5 channels of 16 bits: save red, green and blue"):
         collect_images([tmp_path])
+
+
+def test_that_no_value_is_bright_is_said_before_the_work(tmp_path):
+    for k in range(COUNT):
+        Image.fromarray(noise(k)[..., 0].astype(np.uint16) * 16).save(tmp_path / f"{k}.tif")
+    with pytest.raises(CaptureError, match=r"0\.tif: has 16 bits a pixel, of which it uses no value above .*Scale"):
+        collect_images([tmp_path])
+    flight(tmp_path)
+    assert any("no value above" in note and "3 of 3 looked at" in note for note in collect_images([tmp_path]).notes)
+
+
+def test_why_a_folder_shows_no_photographs_is_said(tmp_path):
+    (tmp_path / "zipped").mkdir()
+    (tmp_path / "zipped" / "photos.tar.gz").write_bytes(b"x")
+    with pytest.raises(CaptureError, match=r"1 other file\. Unpack photos\.tar\.gz"):
+        collect_images([tmp_path / "zipped"])
+    with pytest.raises(CaptureError, match=r"photos\.tar\.gz: is an archive\. Unpack it"):
+        collect_images([tmp_path / "zipped" / "photos.tar.gz"])
+    (tmp_path / "named").mkdir()
+    for k, name in enumerate(("ortho_1.jpg", "ortho_2.jpg", "DEM_3.jpg")):
+        Image.fromarray(noise(k)).save(tmp_path / "named" / name)
+    with pytest.raises(CaptureError, match=r"3 images that are left out by their names: DEM_3\.jpg is a map.*Rename"):
+        collect_images([tmp_path / "named"])
