@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vdgs.captures.capture import spread_evenly
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import decode_image
@@ -166,7 +165,7 @@ def _undecodable(photographs: Sequence[ImageMetadata]) -> list[str]:
     """What is wrong with the pixels of photographs of 16 bits, whose values may be those of fewer, by some of them.
     Raises CaptureError where none of a set can be decoded, before any work."""
     deep = [photo for photo in photographs if "16 bits" in photo.kind]
-    looked_at, faults = spread_evenly(deep, _LOOKED_AT), list[str]()
+    looked_at, faults = deep[:: max(1, len(deep) // _LOOKED_AT)][:_LOOKED_AT], list[str]()
     for photo in looked_at:
         try:
             decode_image(photo.path)
