@@ -251,3 +251,51 @@ def test_without_a_decoder_the_message_says_what_installs_it(tmp_path, monkeypat
         with pytest.raises(CaptureError, match=rf"needs {package} .*: pip install 'vdgs\[photos\]'"):
             read(tmp_path / name)
     optional_decoders._register_heif.cache_clear()
+
+
+def write_tiff(file, channels: np.ndarray, **more) -> None:
+    """A TIFF of channels [h, w, n] as GDAL writes it."""
+    import rasterio
+
+    height, width, count = channels.shape
+    more["transform"] = rasterio.Affine.scale(2)
+    shape = {"driver": "GTiff", "width": width, "height": height, "count": count, "dtype": channels.dtype.name}
+    with rasterio.open(file, "w", **(shape | more)) as picture:
+        for k in range(count):
+            picture.write(channels[..., k], k + 1)
+
+
+@pytest.mark.parametrize("factor", [1, 257])
+@pytest.mark.parametrize(("alpha", "is_mask"), [("no", False), ("unspecified", False), ("yes", True)])
+def test_the_fourth_channel_of_a_tiff_is_transparency_where_its_tags_say_so(tmp_path, factor, alpha, is_mask):
+    """Near infrared, as cameras of four bands write it, hides nothing."""
+    fourth = np.full((120, WIDE * len(COLORS), 1), 255)
+    fourth[:, : WIDE * 2] = 0
+    channels = (np.concatenate([patches(), fourth], axis=2) * factor).astype(np.uint8 if factor == 1 else np.uint16)
+    write_tiff(tmp_path / "a.tif", channels, photometric="RGB", alpha=alpha)
+    pixels, opaque = decode_image(tmp_path / "a.tif")
+    assert read_tags(tmp_path / "a.tif").has_alpha_channel == verify_image(tmp_path / "a.tif").has_alpha_channel
+    assert (opaque is not None) == read_tags(tmp_path / "a.tif").has_alpha_channel == is_mask
+    assert ("the first 3 of 4 channels" in read_tags(tmp_path / "a.tif").kind) != is_mask
+    assert np.allclose(middles(pixels)[2:], COLORS[2:], atol=1)
+    if opaque is not None:
+        assert np.array_equal(opaque, fourth[..., 0] > 0)
+
+
+def test_a_tiff_of_gray_keeps_its_transparency(tmp_path):
+    gray, fourth = Image.fromarray(patches()[..., 0]), patches()[..., 1]
+    gray.putalpha(Image.fromarray(fourth))
+    gray.save(tmp_path / "a.tif")
+    assert np.array_equal(decode_image(tmp_path / "a.tif")[1], fourth >= 128)
+
+
+def test_channels_of_16_bits_one_behind_the_other_are_refused(tmp_path):
+    """Decoders mix them up."""
+    write_tiff(tmp_path / "a.tif", patches().astype(np.uint16) * 257, photometric="RGB", interleave="BAND")
+    with pytest.raises(CaptureError, match="3 channels of 16 bits, one behind the other: save red"):
+        read_header(tmp_path / "a.tif")
+
+
+def test_values_of_12_bits_are_scaled_by_the_white_that_their_tag_says(tmp_path):
+    Image.fromarray(patches()[..., 0].astype(np.uint16) * 16).save(tmp_path / "a.tif", tiffinfo={281: 4080})
+    assert np.array_equal(middles(decode_image(tmp_path / "a.tif")[0])[:, 0], COLORS[:, 0])

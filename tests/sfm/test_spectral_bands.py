@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from support.flights import write_photograph
+from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.xmp import read_xmp
 
@@ -26,12 +27,12 @@ def flight(folder: Path) -> list[str]:
     return names
 
 
-def bands(folder: Path, names: list[str], xmp: str = "") -> None:
+def bands(folder: Path, names: list[str], xmp: str = "", size: tuple[int, int] = (160, 120)) -> None:
     for k, name in enumerate(names):
         exif = Image.Exif()
         exif[0x010F], exif[0x0110] = "Maker", "Bands"
         exif.get_ifd(0x8769)[0x920A] = 5.4
-        gray = noise(k)[..., 0].astype(np.uint16) * 257
+        gray = np.kron(noise(k)[..., 0], np.ones((2, 2)))[: size[1], : size[0]].astype(np.uint16) * 257
         more = {0x02BC: (xmp % k).encode()} if xmp else {}
         Image.fromarray(gray).save(folder / name, exif=exif, tiffinfo=more)
 
@@ -70,3 +71,91 @@ def test_bands_are_known_by_their_tags(tmp_path):
     assert excluded["DJI_0012.TIF"].startswith("is of the band Blue 0;")
     three = packet % 0 + packet.replace("</rdf:li>", "</rdf:li><rdf:li>Red</rdf:li>") % 0
     assert "Camera:BandName" not in read_xmp(three.partition("</Camera:BandName>")[2].encode())
+
+
+def test_bands_that_were_saved_as_color_are_known_by_their_tags_and_their_gray(tmp_path):
+    names = flight(tmp_path)
+    for k in range(COUNT):
+        for band in ("Green", "NIR"):
+            gray = Image.fromarray(noise(k)[..., 0]).convert("RGB")
+            gray.save(tmp_path / f"IMG_{k:04d}_{band}.jpg", xmp=f'<x Camera:BandName="{band}"/>'.encode())
+    with Image.open(tmp_path / names[0]) as first:  # a color photograph that names a band is none of a band
+        first.save(tmp_path / names[0], exif=first.info["exif"], xmp=b'<x Camera:BandName="Green"/>', quality=95)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == names
+    assert any("Green (6), NIR (6); the 6 color photographs" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("size", "band", "used"), [((128, 100), "LWIR", 2), ((320, 240), "Panchro", 6), ((160, 120), "band 6", 2)]
+)
+def test_the_sixth_band_is_known_by_its_size(tmp_path, size, band, used):
+    """Altum's is thermal and smaller, RedEdge-P's panchromatic and larger, the tenfold RedEdge's another blue."""
+    bands(tmp_path, [f"IMG_{k:04d}_{number}.tif" for k in range(COUNT) for number in range(1, 7)])
+    if size != (160, 120):
+        bands(tmp_path, [f"IMG_{k:04d}_6.tif" for k in range(COUNT)], size=size)
+    found = collect_images([tmp_path])
+    assert {photo.name for photo in found.images} == {f"IMG_{k:04d}_{used}.tif" for k in range(COUNT)}
+    assert any(f"{band} (6)" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("tags", [True, False])
+def test_color_and_a_band_are_not_used_together(tmp_path, tags):
+    """Of a color camera whose lens is unknown the photographs are used; pictures without any tags are none of a camera
+    beside bands that say theirs."""
+    colors = [f"IMG_{k:04d}_RGB.JPG" for k in range(COUNT)]
+    for k, name in enumerate(colors):
+        exif = Image.Exif()
+        if tags:
+            exif[0x010F], exif[0x0110] = "Parrot", "Sequoia"
+        Image.fromarray(noise(k)).save(tmp_path / name, exif=exif, quality=95)
+    bands(tmp_path, [f"IMG_{k:04d}_{band}.TIF" for k in range(COUNT) for band in ("GRE", "NIR")])
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == (
+        colors if tags else [f"IMG_{k:04d}_GRE.TIF" for k in range(COUNT)]
+    )
+    if not tags:
+        reasons = {each.name: each.reason for each in found.excluded}
+        assert "none of the band Green" in reasons[colors[0]]
+
+
+def test_of_a_tiff_of_five_channels_it_is_said_what_it_is(tmp_path):
+    import rasterio
+
+    for k in range(COUNT):
+        shape = {
+            "driver": "GTiff",
+            "width": 160,
+            "height": 120,
+            "count": 5,
+            "dtype": "uint16",
+            "transform": rasterio.Affine.scale(2),
+        }
+        with rasterio.open(tmp_path / f"{k}.tif", "w", **shape) as file:
+            for band in range(5):
+                file.write(noise(k)[..., band % 3].astype(np.uint16) * 257, band + 1)
+    with pytest.raises(CaptureError, match=r"0\.tif: is a TIFF of 5 channels of 16 bits: save red, green and blue"):
+        collect_images([tmp_path])
+
+
+def test_that_no_value_is_bright_is_said_before_the_work(tmp_path):
+    for k in range(COUNT):
+        Image.fromarray(noise(k)[..., 0].astype(np.uint16) * 16).save(tmp_path / f"{k}.tif")
+    with pytest.raises(CaptureError, match=r"0\.tif: has 16 bits a pixel, of which it uses no value above .*Scale"):
+        collect_images([tmp_path])
+    flight(tmp_path)
+    assert any("no value above" in note and "3 of 3 looked at" in note for note in collect_images([tmp_path]).notes)
+
+
+def test_why_a_folder_shows_no_photographs_is_said(tmp_path):
+    (tmp_path / "zipped").mkdir()
+    (tmp_path / "zipped" / "photos.tar.gz").write_bytes(b"x")
+    with pytest.raises(CaptureError, match=r"1 other file\. Unpack photos\.tar\.gz"):
+        collect_images([tmp_path / "zipped"])
+    with pytest.raises(CaptureError, match=r"photos\.tar\.gz: is an archive\. Unpack it"):
+        collect_images([tmp_path / "zipped" / "photos.tar.gz"])
+    (tmp_path / "named").mkdir()
+    for k, name in enumerate(("ortho_1.jpg", "ortho_2.jpg", "DEM_3.jpg")):
+        Image.fromarray(noise(k)).save(tmp_path / "named" / name)
+    with pytest.raises(CaptureError, match=r"3 images that are left out by their names: DEM_3\.jpg is a map.*Rename"):
+        collect_images([tmp_path / "named"])

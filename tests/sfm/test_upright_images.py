@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 from threading import Barrier
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from PIL import Image
 from rich.console import Console
 
 from support.flights import write_photograph
+from vdgs.errors import CaptureError
 from vdgs.sfm import feature_extraction
-from vdgs.sfm.feature_extraction import prepare_images, write_upright_images
-from vdgs.sfm.image_list import collect_images
+from vdgs.sfm.feature_extraction import images_without_features, prepare_images, write_upright_images
+from vdgs.sfm.image_list import ExcludedImage, collect_images
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.workspace import Workspace
 
@@ -63,3 +65,12 @@ def test_what_lasts_is_shown_once(tmp_path, decoded):
         sound = [photo for photo in photographs if photo.name not in ("5.png", "6.png")]
         assert prepare_images(Workspace(tmp_path / "work"), sound, 1, console) == []
         assert ("features, decoded, photographs: 7" in console.file.getvalue()) is (decoded and not again)
+
+
+def test_of_photographs_that_cannot_be_decoded_the_decoder_says_why(tmp_path):
+    names = [f"{k}.jpg" for k in range(4)]
+    seen = [SimpleNamespace(name=name, may_be_masked=False) for name in names]
+    failed, counts = [ExcludedImage("0.jpg", "is black, as it is. Scale it.")], dict.fromkeys(names[1:], 900)
+    assert images_without_features(seen, counts, failed) == failed
+    with pytest.raises(CaptureError, match=r"needs 3\. The first: 0\.jpg is black, as it is\. Scale it\.$"):
+        images_without_features(seen[:3], counts, failed)

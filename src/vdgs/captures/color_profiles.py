@@ -9,6 +9,8 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image, ImageCms
 
+from vdgs.captures.tiff_channels import has_alpha_channel
+
 #: Values that differ by no more (of 255) are of the same space, computed otherwise.
 _SAME = 4
 #: EXIF's directory of interoperability, and what names Adobe RGB there.
@@ -33,7 +35,7 @@ def foreign_space(image: Image.Image) -> str:
 
 def to_srgb(image: Image.Image) -> Image.Image:
     """The picture as 8-bit RGB in sRGB, RGBA where it has an alpha channel. Colors out of sRGB's gamut are clipped."""
-    transparent = "A" in image.getbands() or "transparency" in image.info
+    transparent = has_alpha_channel(image)
     profile, mode = _profile_of(image), _CMYK if image.mode == _CMYK else "RGB"
     colors = image if image.mode == mode else image.convert(mode)
     if _foreign(profile, mode):

@@ -26,12 +26,14 @@ from vdgs.captures.image_suffixes import (
     IMAGE_SUFFIXES,
     OTHER_IMAGE_SUFFIXES,
     RAW_SUFFIXES,
+    TIFF_SUFFIXES,
 )
 from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end, with_end
 from vdgs.captures.name_resolution import find_file
 from vdgs.captures.optional_decoders import has_decoder, prepare_heif
 from vdgs.captures.raw_files import develop, is_raw, raw_size
 from vdgs.captures.strays import is_hidden
+from vdgs.captures.tiff_channels import as_tags_say, has_alpha_channel, why_no_picture
 from vdgs.captures.tiff_orientation import stored_size, without_orientation
 from vdgs.captures.xmp_packets import exif_of
 from vdgs.errors import CaptureError
@@ -150,6 +152,8 @@ def read_header(path: Path) -> ImageHeader:
     except PermissionError as error:
         raise CaptureError(f"{path}: {refusal(path, error)}") from None
     except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
+        if why := why_no_picture(path):
+            raise CaptureError(f"{path}: {why}.") from None
         raise CaptureError(
             f"{path}: not an image that can be read ({error}). Copy it again, or convert it to 8-bit RGB if other "
             "programs show it."
@@ -160,6 +164,8 @@ def read_header(path: Path) -> ImageHeader:
         raise CaptureError(
             f"{path}: is {header.width}x{header.height} pixels, too small to show anything. Copy the image again."
         )
+    if path.suffix.lower() in TIFF_SUFFIXES and (why := why_no_picture(path)):
+        raise CaptureError(f"{path}: {why}.")
     if header.mode not in SUPPORTED_MODES:
         raise CaptureError(f"{path}: has the color mode {header.mode}; convert it to 8-bit RGB.")
     return header
@@ -248,7 +254,8 @@ def _in_rgb(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
         if 0 < pixels.max() <= _DARK:
             raise CaptureError(
                 f"{path}: has 16 bits a pixel, of which it uses no value above {pixels.max()} of 65535: black, as it "
-                "is. Scale the values of all photographs by one factor."
+                "is. Scale the values of all photographs by one factor, or let MaxSampleValue (tag 281) say "
+                "which value is white."
             )
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:
@@ -332,7 +339,7 @@ def _decode_bytes(path: Path, data: np.ndarray) -> np.ndarray:
             raise
         pixels = None
     if pixels is not None and pixels.ndim in (2, 3) and (pixels.ndim == 2 or pixels.shape[2] in (3, 4)):
-        return pixels
+        return as_tags_say(pixels, data)
     try:
         with pillow_without_limits(), Image.open(io.BytesIO(data.tobytes())) as image:
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
@@ -352,7 +359,7 @@ def _converted(path: Path, data: np.ndarray) -> np.ndarray | None:
     try:
         prepare_heif(path)
         with pillow_without_limits(), Image.open(io.BytesIO(data.tobytes())) as image:
-            if not own and not foreign_space(image):
+            if not own and not foreign_space(image) and (image.format, image.mode) != ("TIFF", "LA"):
                 return None
             pixels = np.asarray(to_srgb(image))
             return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])
@@ -385,7 +392,7 @@ def verify_image(path: Path) -> VerifiedImage:
                 image.draft(image.mode, (max(1, image.width // 8), max(1, image.height // 8)))
             image.load()
             ranges = [_extremes(image, band) for band in image.getbands() if band != "A"]
-            transparent = "A" in image.getbands() or "transparency" in image.info
+            transparent = has_alpha_channel(image)
     except PermissionError as error:
         raise CaptureError(f"{path}: {refusal(path, error)}") from None
     except Exception as error:  # any complaint of a decoder is what we came for

@@ -1,6 +1,7 @@
 """What files of photographs and films are called, which is asked before any library that decodes them is loaded."""
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
+TIFF_SUFFIXES = {".tif", ".tiff"}
 #: Suffixes of raw files. What is a JPEG inside is none.
 RAW_SUFFIXES = {
     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".raw", ".gpr", ".3fr", ".iiq",

@@ -12,6 +12,7 @@ from vdgs.captures.color_profiles import foreign_space
 from vdgs.captures.image_files import mode_of, open_image
 from vdgs.captures.jpeg import JPEGS, has_end
 from vdgs.captures.raw_files import is_raw, raw_size, raw_tags
+from vdgs.captures.tiff_channels import has_alpha_channel, unused_channels
 from vdgs.captures.tiff_orientation import stored_size
 from vdgs.captures.xmp_packets import exif_of, xmp_of
 
@@ -47,7 +48,7 @@ class ImageTags:
     """False for a JPEG without an end marker."""
     kind: str
     """What makes it other than 8-bit sRGB in a file that all programs read: HEIC, WebP, raw, CMYK, Display P3, 16 bits
-    a channel; empty for what is."""
+    a channel, more channels than colors; empty for what is."""
     has_temperatures: bool = False
     """Whether it is a radiometric JPEG of a thermal camera."""
 
@@ -73,11 +74,19 @@ def read_tags(path: Path) -> ImageTags:
             details=dict(exif.get_ifd(_EXIF_IFD)),
             gps=dict(exif.get_ifd(_GPS_IFD)),
             xmp_packet=xmp_of(image),
-            has_alpha_channel="A" in image.getbands() or "transparency" in image.info,
+            has_alpha_channel=has_alpha_channel(image),
             whole=image.format not in JPEGS or has_end(path, image),
             kind=kind,
             has_temperatures=_has_temperatures(image),
         )
+
+
+def may_be_transparent(path: Path) -> bool:
+    """`ImageTags.has_alpha_channel` of a file whose head can be read."""
+    if is_raw(path):
+        return False
+    with open_image(path) as image:
+        return has_alpha_channel(image)
 
 
 def kind_of(path: Path) -> str:
@@ -91,7 +100,8 @@ def kind_of(path: Path) -> str:
 def _kind(image: Image.Image) -> str:
     space = foreign_space(image)
     colors = space or ("16 bits a channel" if _has_16_bits(image) else "")
-    return ", ".join(filter(None, (_uncommon_format(image), colors)))
+    channels = unused_channels(image.tag_v2) if image.format == "TIFF" else ""  # type: ignore[attr-defined]
+    return ", ".join(filter(None, (_uncommon_format(image), channels, colors)))
 
 
 def _has_temperatures(image: Image.Image) -> bool:

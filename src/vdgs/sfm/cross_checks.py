@@ -25,10 +25,6 @@ LEVEL_DEG = 1.0
 LEAST_ALIKE = 3
 #: A mask by another name is black and white: this share of it lies within so many gray values of the two.
 BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
-#: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
-_PREFERRED = ("panchro", "green", "red", "blue")
-#: Fewer color photographs than this share of the exposures are none of the set.
-_COLOR_SHARE = 0.5
 _FLAT = "that the receiver measured no altitude (GPSMeasureMode 2)"
 #: Sides of the small picture that tells a mask.
 _LOOKED_AT = (128, 128)
@@ -233,29 +229,3 @@ def is_black_and_white(photo: ImageMetadata) -> bool:
     except (OSError, SyntaxError, ValueError):
         return False
     return float(np.minimum(gray, 255 - gray).__le__(NEAR_GRAY).mean()) >= BLACK_AND_WHITE
-
-
-def unused_bands(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], list[str]]:
-    """The pictures of bands that are not used, with the reason, and what people should know of the set."""
-    counts = Counter(photo.band for photo in photographs if photo.band)
-    if not counts:
-        return {}, []
-    bands = ", ".join(f"{band} ({number})" for band, number in sorted(counts.items()))
-    color = sum(not photo.band and photo.lens is not None for photo in photographs)
-    if color >= _COLOR_SHARE * max(counts.values()):
-        used, how = "", f"the {color} color photographs beside them are used"
-    else:
-        used = min(counts, key=lambda band: (_rank(band), -counts[band], band))
-        how = f"{used} is used, in gray, without calibration of reflectance"
-    left = {
-        photo.name: f"is of the band {photo.band}; a folder of one band alone can be used"
-        for photo in photographs
-        if photo.band and photo.band != used
-    }
-    return left, [f"pictures of single bands: {bands}; {how}."]
-
-
-def _rank(band: str) -> int:
-    alike = [k for k, name in enumerate(_PREFERRED) if band.lower().replace("_", " ").split(" ")[0].startswith(name)]
-    edge = "edge" in band.lower()
-    return alike[0] if alike and not edge else len(_PREFERRED) + edge

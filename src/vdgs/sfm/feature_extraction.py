@@ -282,12 +282,17 @@ def count_features(workspace: Workspace) -> dict[str, int]:
         }
 
 
-def images_without_features(photographs: Sequence[ImageMetadata], counts: dict[str, int]) -> list[ExcludedImage]:
-    """Photographs that COLMAP could not decode, or found nearly nothing in (outside their masks)."""
-    found = []
+def images_without_features(
+    photographs: Sequence[ImageMetadata], counts: dict[str, int], failed: Sequence[ExcludedImage] = ()
+) -> list[ExcludedImage]:
+    """Photographs that could not be decoded (`failed`, which says why, or by COLMAP), or show nearly nothing (outside
+    their masks)."""
+    reasons, found = {each.name: each for each in failed}, []
     for photo in photographs:
         count = counts.get(photo.name)
-        if count is None:
+        if photo.name in reasons:
+            found.append(reasons[photo.name])
+        elif count is None:
             found.append(ExcludedImage(photo.name, UNDECODABLE))
         elif count < MIN_FEATURES:
             where = " where its mask is white" if photo.may_be_masked else ""
@@ -295,6 +300,6 @@ def images_without_features(photographs: Sequence[ImageMetadata], counts: dict[s
     if len(photographs) - len(found) < 3:
         raise CaptureError(
             f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene "
-            f"needs 3. The first: {found[0].name} {found[0].reason}."
+            f"needs 3. The first: {found[0].name} {found[0].reason.rstrip('.')}."
         )
     return found

@@ -25,6 +25,8 @@ from vdgs.errors import CaptureError
 from vdgs.system.quoting import check_is_text
 from vdgs.system.units import first_names
 
+#: What photographs are sent and downloaded in.
+_ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tar.xz", ".tar.zst")
 #: Files beside a photograph that are no news.
 _SILENT = {".ds_store", "thumbs.db", "desktop.ini"}
 
@@ -44,6 +46,8 @@ class Found:
     """Photographs of kinds that are not read, by their suffix."""
     doubled: Counter[str] = field(default_factory=Counter)
     """HEIC and raw files beside a picture of the same name, by their suffix."""
+    archives: list[str] = field(default_factory=list)
+    """Names of files in which photographs may be packed."""
     dangling: list[Path] = field(default_factory=list)
     """Links to what is not there."""
     renamed: dict[str, str] = field(default_factory=dict)
@@ -97,6 +101,11 @@ def is_photograph(path: Path) -> bool:
 def is_film(path: Path) -> bool:
     """Whether a file is a film by its name."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def is_archive(path: Path) -> bool:
+    """Whether photographs may be packed in a file, by its name."""
+    return path.name.lower().endswith(_ARCHIVES) and not path.name.startswith(".") and path.is_file()
 
 
 def films_in(paths: Sequence[Path]) -> list[Path]:
@@ -170,6 +179,8 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
             found.dangling.append(path)
         return
     found.others += path.is_file()
+    if is_archive(path):
+        found.archives.append(path.name)
     if suffix in OTHER_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
     elif suffix in HEIF_SUFFIXES | RAW_SUFFIXES:
@@ -186,9 +197,17 @@ def nothing_found(folders: Sequence[Path], found: Found) -> CaptureError:
             f"{_count(number, suffix)} not read: {_remedy(suffix)}" for suffix, number in found.unread.items()
         )
         return CaptureError(f"{said}. {kinds}.")
-    left = len(found.left_out)
-    others = f", but {found.others} other files" if found.others else ""
-    others += f", and {left} images that are no photographs ({next(iter(found.left_out))}, ...)" if left else ""
+    others = f", but {found.others} other file{'s' if found.others > 1 else ''}" if found.others else ""
+    if found.archives:
+        return CaptureError(
+            f"{said}{others}. Unpack {first_names(found.archives)}, and give the folder of what was in it."
+        )
+    if found.left_out:
+        name, why = next(iter(found.left_out.items()))
+        return CaptureError(
+            f"{said}{others}, and {len(found.left_out)} images that are left out by their names: {name} {why}. Rename "
+            "them if they are photographs (IMG_0001.JPG, ...)."
+        )
     skipped = f" Not looked into: {', '.join(list(found.skipped)[:5])}." if found.skipped else ""
     return CaptureError(f"{said}{others}.{skipped}")
 

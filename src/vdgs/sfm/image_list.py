@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
+from vdgs.captures.image_files import decode_image
 from vdgs.captures.image_suffixes import HEIF_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
 from vdgs.captures.name_resolution import jpeg_name, match_key
 from vdgs.captures.nested_captures import check_no_foreign_file, foreign_poses, model_below
@@ -18,19 +19,30 @@ from vdgs.captures.strays import check_no_run, walk
 from vdgs.config.sfm_options import Brackets, CameraModel
 from vdgs.errors import CaptureError
 from vdgs.sfm.brackets import unused_exposures
-from vdgs.sfm.cross_checks import cross_checked, strays, unused_bands
-from vdgs.sfm.find_images import check_decoders, find_files, is_dangling, is_film, is_photograph, nothing_found
+from vdgs.sfm.cross_checks import cross_checked, strays
+from vdgs.sfm.find_images import (
+    check_decoders,
+    find_files,
+    is_archive,
+    is_dangling,
+    is_film,
+    is_photograph,
+    nothing_found,
+)
 from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wide, read_image_metadata
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.photograph_versions import taken_apart
 from vdgs.sfm.rig_folders import with_sensors
 from vdgs.sfm.sidecars import with_sidecars
+from vdgs.sfm.used_bands import unused_bands
 from vdgs.system.content_digests import find_copies
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 
 #: Fewer photographs are no scene.
 MIN_IMAGES = 3
+#: So many photographs of 16 bits are decoded before work begins: they come from one camera.
+_LOOKED_AT = 3
 
 
 @dataclass(frozen=True)
@@ -72,6 +84,8 @@ def collect_images(
     for folder in folders:
         if not folder.is_dir() and not is_capture(folder):
             check_no_foreign_file(folder)
+            if is_archive(folder):
+                raise CaptureError(f"{folder}: is an archive. Unpack it, and give the folder of the photographs.")
             what = "is a file, and no film" if folder.is_file() else "no such folder or film"
             raise CaptureError(f"{folder}: {what}. Give the folder that the photographs are in.")
         check_no_run(folder)
@@ -109,6 +123,7 @@ def collect_images(
     left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
     left_out = [replace(each, file=found.renamed.get(each.name)) for each in left_out]
     notes = [*found.notes(), *notes, *spectral, *bracketed, *rigs, *_kind_notes(photographs)]
+    notes += _undecodable(photographs)
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
         said = [each.line for each in left_out]
@@ -145,6 +160,21 @@ def is_image_folder(folder: Path) -> bool:
         for _, files, _ in walk(folder)
         for path in files
     )
+
+
+def _undecodable(photographs: Sequence[ImageMetadata]) -> list[str]:
+    """What is wrong with the pixels of photographs of 16 bits, whose values may be those of fewer, by some of them.
+    Raises CaptureError where none of a set can be decoded, before any work."""
+    deep = [photo for photo in photographs if "16 bits" in photo.kind]
+    looked_at, faults = deep[:: max(1, len(deep) // _LOOKED_AT)][:_LOOKED_AT], list[str]()
+    for photo in looked_at:
+        try:
+            decode_image(photo.path)
+        except CaptureError as error:
+            faults.append(str(error))
+    if faults and len(faults) == len(looked_at) and len(deep) == len(photographs):
+        raise CaptureError(faults[0])
+    return [f"{fault.rstrip('.')} ({len(faults)} of {len(looked_at)} looked at)." for fault in faults[:1]]
 
 
 def _kind_notes(photographs: Sequence[ImageMetadata]) -> list[str]:

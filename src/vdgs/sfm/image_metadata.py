@@ -13,8 +13,10 @@ import numpy as np
 from PIL import UnidentifiedImageError
 
 from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES
+from vdgs.captures.image_suffixes import TIFF_SUFFIXES
 from vdgs.captures.image_tags import ImageTags, read_tags
 from vdgs.captures.jpeg import lacks_only_end
+from vdgs.captures.tiff_channels import why_no_picture
 from vdgs.errors import CaptureError
 from vdgs.sfm.exif_gps import (
     Altitude,
@@ -274,6 +276,8 @@ def _read_head(path: Path) -> tuple[int, ImageTags, dict[str, str], bool]:
     """The bytes of a photograph, its tags, its XMP and whether it is a panorama."""
     try:
         size, found = path.stat().st_size, read_tags(path)
+        if path.suffix.lower() in TIFF_SUFFIXES and (why := why_no_picture(path)):
+            raise UnusableImage(why)
         _check(found)
         xmp = read_xmp(found.xmp_packet)
         return size, found, xmp, _is_panorama(found, xmp)
@@ -343,7 +347,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         doubts=tuple(filter(None, (unclear, datum, default, *((lens.doubt, lens.remark) if lens else ())))),
         whole=found.whole,
         kind=found.kind,
-        band=band_of(name, found.mode, xmp),
+        band=band_of(path, found.mode, xmp),
         camera_model=FISHEYE if _is_fisheye(details, xmp) else RADIAL,
         is_panorama=panorama,
         exposure_bias=finite(details.get(0x9204)),
@@ -355,6 +359,8 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
 
 def _not_an_image(path: Path) -> str:
     """Why Pillow knows no format for a file."""
+    if why := why_no_picture(path):
+        return why
     with path.open("rb") as file:
         head = file.read(12)
     if head[4:8] == b"ftyp":

@@ -324,10 +324,7 @@ def _features(
         mask_files.write_upright_masks(workspace, photographs, plan.threads)
         counts = feature_extraction.extract_features(workspace, camera_groups, options, plan.threads, console)
         workspace.finish("features", key)
-    named = {each.name for each in failed}
-    return failed + [
-        each for each in feature_extraction.images_without_features(photographs, counts) if each.name not in named
-    ]
+    return feature_extraction.images_without_features(photographs, counts, failed)
 
 
 def _matches(plan: ReconstructionPlan, workspace: Workspace, key: str, console: Console) -> int:
