@@ -152,12 +152,11 @@ class ClientSession:
     def _step_back_if_narrow(self) -> None:
         """All browsers begin where a window at least as wide as high shows all: a narrower one must stand farther
         away. Where an address names another first view, that stays."""
-        begin = navigation.overview_pose(self.scene.capture)
-        if self._camera is None or not np.allclose(self.pose.position, begin.position, atol=1e-3 * begin.distance):
+        if self._camera is None or self._camera.width >= self._camera.height:
             return
-        aspect = self._camera.width / self._camera.height
-        if aspect < 1.0:
-            self.move_to(navigation.overview_pose(self.scene.capture, aspect))
+        begin = navigation.overview_pose(self.scene.capture)
+        if np.allclose(self.pose.position, begin.position, atol=1e-3 * begin.distance):
+            self.move_to(navigation.overview_pose(self.scene.capture, self._camera.width / self._camera.height))
 
     def _hide_image_if_left(self, camera: Camera) -> None:
         index = self._display.image_index

@@ -341,10 +341,10 @@ def _guard_requests(
         if response is not None:
             response.headers["Referrer-Policy"] = "no-referrer"
             response.headers["X-Frame-Options"] = "DENY"
-            if browser is None:
-                response.headers["Set-Cookie"] = access.set_browser_header()
             if access.has_token(request.path):
                 response.headers["Set-Cookie"] = access.set_cookie_header()
+            if browser is None:
+                response.headers["Set-Cookie"] = access.set_browser_header()
         return response
 
     return answer
