@@ -107,7 +107,9 @@ def test_a_server_that_is_away_for_a_while_is_asked_again_and_a_lost_graphics_ca
         # As a proxy answers while its server is away; and then as no server does.
         page.evaluate(
             "window.plain = fetch; window.asked = 0;"
-            "window.fetch = async () => { if (asked++ % 2) throw new TypeError(); return new Response('', {status: 502}); }"
+            "window.fetch = async () => {"
+            "  if (asked++ % 2) throw new TypeError();"
+            "  return new Response('', {status: 502}); }"
         )
         page.evaluate(move)
         wait_until(lambda: "no connection; trying again" in told(page)[1])
