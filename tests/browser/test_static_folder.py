@@ -91,6 +91,42 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
         assert "copy it whole" in page.evaluate("document.body.innerText")
 
 
+def test_a_server_that_is_away_for_a_while_is_asked_again_and_a_lost_graphics_card_is_said(tmp_path):
+    camera = upright(np.array([2.0, -5.0, 6.0]), SIZE / 2 / np.tan(np.radians(FOV_DEG) / 2))
+    view = InitialView(tuple(3000 * camera.position), (0.0, 0.0, 0.0), title="town")
+    scene = replace(ExportScene.of(random_gaussians(600, 0)), page=view)
+    write_streamed_page(tmp_path / "scene.json", scene, node_size=100)
+    move = "canvas.dispatchEvent(new WheelEvent('wheel', {deltaY: -9000, cancelable: true}))"
+
+    def told(page) -> tuple[str, str]:
+        state, caption = page.evaluate("[document.body.dataset.state, caption.textContent]")
+        return state, caption
+
+    with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
+        wait_until(lambda: told(page)[0] == "complete")
+        # As a proxy answers while its server is away; and then as no server does.
+        page.evaluate(
+            "window.plain = fetch; window.asked = 0;"
+            "window.fetch = async () => {"
+            "  if (asked++ % 2) throw new TypeError();"
+            "  return new Response('', {status: 502}); }"
+        )
+        page.evaluate(move)
+        wait_until(lambda: "no connection; trying again" in told(page)[1])
+        assert told(page)[0] == "loading"
+        before = page.evaluate("asked")
+        wait_until(lambda: page.evaluate("asked") > before)  # by itself
+        page.evaluate("window.fetch = plain")
+        wait_until(lambda: told(page)[0] == "complete")
+        assert "parts" in told(page)[1]
+        page.evaluate("canvas.getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()")
+        wait_until(lambda: told(page)[0] == "failed")
+        page.evaluate(move)
+        page.screenshot()
+        page.screenshot()
+        assert told(page) == ("failed", "The graphics card was lost. Load the page again.")
+
+
 def test_what_stands_alone_far_outside_keeps_nobody_from_coming_near(tmp_path):
     gaussians = random_gaussians(300, 0)
     gaussians.means[0] = torch.tensor([200_000.0, 0.0, 0.0])

@@ -191,6 +191,20 @@ def test_folders_of_photographs_are_known_without_a_capture(tmp_path: Path) -> N
     assert not is_refused(one / "run")  # a folder with a picture in it, such as a home
 
 
+def test_a_file_that_nobody_takes_for_a_photograph_may_lie_among_some(tmp_path: Path) -> None:
+    shots = photographs(tmp_path / "screenshots", 3)
+    one = photographs(tmp_path / "one", 1, "DJI")
+    for name in ("scene.html", "scene.PLY", "x.compressed.ply", "x.spz", "x.sog", "x.glb", "x.laz", "new/x.splat"):
+        assert not is_refused(shots / name), name
+        assert not is_refused(one / name), name
+    for name in ("sky.png", "film.mp4", "map.tif", "tiles/tileset.json", "lod-meta.json", "run"):
+        assert is_refused(shots / name), name
+    (shots / "folder.html").mkdir()
+    assert is_refused(shots / "folder.html")
+    photographs(tmp_path / "DCIM" / "100MEDIA", 3)
+    assert is_refused(tmp_path / "DCIM" / "100MEDIA" / "scene.html")
+
+
 def test_a_few_pictures_are_no_photographs(tmp_path: Path) -> None:
     figures = photographs(tmp_path / "figures", 2)
     assert not is_refused(figures)

@@ -41,10 +41,11 @@ from vdgs.viewer import navigation, server
 from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.layers import Painter
 from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
+from vdgs.viewer.measurement import MeasuredPoint
 from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.point_panel import PointPanel
 from vdgs.viewer.render_scheduler import MAX_CACHED_IMAGES, RenderSession
-from vdgs.viewer.server import find_free_port, serve
+from vdgs.viewer.server import ViewerServer, find_free_port, serve
 
 pytestmark = [pytest.mark.xdist_group("viewer"), pytest.mark.slow]
 
@@ -157,6 +158,116 @@ def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
     read = load_path(file, above())
     assert np.allclose(read.cameras[0].camera_from_world, frames[0].camera_from_world, atol=1e-9)
     assert np.allclose(read.cameras[-1].camera_from_world, frames[1].camera_from_world, atol=1e-9)
+
+
+def browser_cookie(address: str) -> dict[str, str]:
+    """The header by which a browser that has opened the page is known from then on."""
+    _, _, cookie = ask(address)
+    assert "HttpOnly" in cookie
+    return {"Cookie": cookie.split(";")[0]}
+
+
+def newest(viewer: ViewerServer) -> ClientSession:
+    """Who came last, once there is a visitor."""
+    wait_until(lambda: viewer.sessions)
+    return viewer.sessions[max(viewer.sessions)]
+
+
+def leaves_work(viewer: ViewerServer, guest: Guest) -> None:
+    """A key frame, two clicked places and a known distance."""
+    guest.stand(above(1.0, 0.5))
+    visitor = newest(viewer)
+    wait_until(lambda: visitor.camera is not None)
+    visitor.path_panel.add()
+    visitor.path_panel._seconds.value = 7.5
+    measures = visitor.point_panel.measure_panel
+    for x in (0.0, 1.0):
+        measures.add(MeasuredPoint(np.array([x, 0.0, 0.0]), rays=(("a", 0.0, 0.0), ("b", 0.0, 0.0))))
+    measures._meters.value = 5.0
+    measures.save()
+
+
+@quiet
+def test_what_a_visitor_made_outlives_a_lost_connection(viewer):
+    """And nobody else gets it, whoever comes first."""
+    wait_until(lambda: not viewer.sessions)
+    address = viewer.access.local_url()
+    mine, theirs = browser_cookie(address), browser_cookie(address)
+    assert mine != theirs
+    guest = Guest(address, mine)
+    leaves_work(viewer, guest)
+    guest.vanish()
+    wait_until(lambda: not viewer.sessions)
+    for headers in (theirs, None, mine):
+        guest = Guest(address, headers)
+        guest.stand(above())
+        visitor = newest(viewer)
+        measures = visitor.point_panel.measure_panel
+        if headers is mine:
+            wait_until(lambda visitor=visitor: np.allclose(visitor.pose.position, above(1.0, 0.5).position))
+            assert len(visitor.path_panel.keyframes) == 1
+            assert visitor.path_panel._seconds.value == 7.5
+            assert measures.ruler.distance() == 1.0
+            assert [each.meters for each in measures.known] == [5.0]
+            assert "**5 m**" in measures._command.content
+        else:
+            assert not visitor.path_panel.keyframes
+            assert not measures.known
+            assert np.allclose(visitor.pose.position, above().position)
+        guest.close()
+        wait_until(lambda: not viewer.sessions)
+
+
+@quiet
+def test_a_browser_that_is_back_before_its_loss_is_noticed_gets_its_work_too(viewer):
+    wait_until(lambda: not viewer.sessions)
+    mine = browser_cookie(viewer.access.local_url())
+    lost = Guest(viewer.access.local_url(), mine)
+    leaves_work(viewer, lost)
+    back = Guest(viewer.access.local_url(), mine)
+    back.stand(above())
+    wait_until(lambda: len(viewer.sessions) == 2)
+    visitor = newest(viewer)
+    assert not visitor.path_panel.keyframes
+    lost.close()
+    wait_until(lambda: visitor.path_panel.keyframes)
+    assert np.allclose(visitor.pose.position, above().position)  # stays where it has moved meanwhile
+    back.close()
+
+
+@quiet
+def test_measures_are_drawn_where_they_are(viewer, guest):
+    """Browsers keep the position of a name: a line never has the name of what had a position."""
+    guest.stand(above())
+    measures = newest(viewer).point_panel.measure_panel
+    for x, kind in ((1.0, "SetPositionMessage"), (2.0, "LineSegmentsMessage")):
+        measures.add(MeasuredPoint(np.array([x, 0.0, 0.0])))
+        next(message for message in guest.messages() if message["type"] == kind)
+    placed = {each["name"] for each in guest.kept if each["type"] == "SetPositionMessage"}
+    lines = {each["name"] for each in guest.kept if each["type"] == "LineSegmentsMessage"}
+    assert placed
+    assert lines
+    assert not lines & placed
+
+
+@quiet
+def test_a_narrow_window_shows_all_at_first(viewer):
+    wait_until(lambda: not viewer.sessions)
+    capture = viewer.scene.capture
+    for width, height in ((480, 320), (240, 480)):
+        begin = navigation.overview_pose(capture)
+        focal = 0.5 * height / math.tan(math.radians(25))
+        camera = Camera(
+            camera_from_world=look_at_pose(begin.position, begin.look_at), fx=focal, fy=focal, cx=width / 2,
+            cy=height / 2, width=width, height=height,
+        )  # fmt: skip
+        guest = Guest(viewer.access.local_url())
+        guest.stand(camera)
+        visitor = newest(viewer)
+        meant = navigation.overview_pose(capture, width / height)
+        wait_until(lambda visitor=visitor, meant=meant: np.allclose(visitor.pose.position, meant.position))
+        guest.close()
+        wait_until(lambda: not viewer.sessions)
 
 
 @quiet

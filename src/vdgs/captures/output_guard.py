@@ -8,7 +8,8 @@ does the work, for those who call it from Python. What is allowed:
   photographs lie in folders of their own (`project/DCIM`, `project/run`);
 - anything in a run but the folders of its stages, and in a capture but its inputs, wherever the run or capture lies;
 - a new folder in a capture whose photographs lie in its root (no file there);
-- a folder of results (a render, maps): they are no photographs (`strays.why_not_read`).
+- a folder of results (a render, maps): they are no photographs (`strays.why_not_read`);
+- a file that nobody takes for a photograph (a page, a file of Gaussians or points), but in what a camera fills.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ _OF_STAGES = re.compile(r"coarse|visibility|partition|blocks|merged|lod|evaluati
 _MEGA_NERF = ("rgbs", "metadata")
 #: What cameras call the folder of all that they took.
 _CAMERA_FOLDER = "dcim"
+#: Endings of single files that cannot be taken for photographs and hold none beside them.
+_NO_PICTURES = {".html", ".ply", ".spz", ".splat", ".sog", ".rad", ".glb", ".laz", ".las"}
 #: So many pictures are photographs, whatever they say of themselves: with fewer there is no scene (`sfm.image_list`).
 _MANY_PICTURES = 3
 
@@ -122,7 +125,7 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
         return False
     if folder.name.lower() == _CAMERA_FOLDER:
         return True
-    if why_not_read(folder) is not None:
+    if why_not_read(folder) is not None or (output.suffix.lower() in _NO_PICTURES and not output.is_dir()):
         return False
     suffixes = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
     pictures = [folder / name for name, is_file in names.items() if is_file and Path(name).suffix.lower() in suffixes]

@@ -8,6 +8,7 @@ token of the printed address, which the browser keeps as a cookie.
 from __future__ import annotations
 
 import hmac
+import secrets
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -85,13 +86,27 @@ class AccessControl:
         """The header's value that lets the browser in from now on: for this site's own requests only."""
         return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
+    def browser_of(self, headers: Mapping[str, str]) -> str | None:
+        """What tells a browser from others, by the cookie that it was given; None if it has none."""
+        return _cookie(headers.get("Cookie", ""), f"{self.cookie_name}_browser") or None
+
+    def set_browser_header(self) -> str:
+        """The header's value that gives a browser such a cookie, until it is closed."""
+        return f"{self.cookie_name}_browser={secrets.token_urlsafe(18)}; HttpOnly; SameSite=Strict; Path=/"
+
     def _has_cookie(self, header: str) -> bool:
-        try:
-            found = SimpleCookie(header).get(self.cookie_name)
-        except CookieError:
-            return False
         assert self.token is not None
-        return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())
+        found = _cookie(header, self.cookie_name)
+        return found is not None and hmac.compare_digest(found.encode(), self.token.encode())
+
+
+def _cookie(header: str, name: str) -> str | None:
+    """The value of a cookie in a Cookie header."""
+    try:
+        found = SimpleCookie(header).get(name)
+    except CookieError:
+        return None
+    return None if found is None else found.value
 
 
 def _short(value: str) -> str:

@@ -22,6 +22,7 @@ from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.point_panel import PointPanel
 from vdgs.viewer.render_scheduler import RenderedFrame, RenderScheduler
 from vdgs.viewer.viewer_scene import ViewerScene
+from vdgs.viewer.visitor_work import VisitorWork
 from vdgs.visibility.visibility_counts import FADE_BELOW
 
 #: Labels of the layers in the panel.
@@ -59,6 +60,7 @@ class ClientSession:
         height = scene.camera_height
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
         self._on_camera_moved()
+        self._step_back_if_narrow()
 
     @property
     def camera(self) -> Camera | None:
@@ -88,6 +90,21 @@ class ClientSession:
             if fov is not None:
                 camera.fov = float(fov)
         self._on_camera_moved(from_browser=False)
+
+    def work(self) -> VisitorWork:
+        """What this visit leaves."""
+        return VisitorWork(
+            self.pose, float(self.client.camera.fov), self.path_panel.work(), self.point_panel.measure_panel.work()
+        )
+
+    def restore(self, work: VisitorWork, moves: bool) -> None:
+        """Go on with what an earlier visit left, and from where it stood if `moves`."""
+        self.path_panel.restore(work.path)
+        self.point_panel.measure_panel.restore(work.measures)
+        if moves:
+            self.move_to(work.pose, work.fov)
+        if not work.is_empty:
+            self.notify("Connected again", "Key frames, clicked places and known distances are as they were.")
 
     def view_image(self, index: int) -> None:
         """Move to the camera of a photograph, with the photograph over the model."""
@@ -131,6 +148,15 @@ class ClientSession:
             if from_browser:
                 self._hide_image_if_left(camera)
             self.scheduler.request_frame(self._render_session, camera, self._display)
+
+    def _step_back_if_narrow(self) -> None:
+        """All browsers begin where a window at least as wide as high shows all: a narrower one must stand farther
+        away. Where an address names another first view, that stays."""
+        if self._camera is None or self._camera.width >= self._camera.height:
+            return
+        begin = navigation.overview_pose(self.scene.capture)
+        if np.allclose(self.pose.position, begin.position, atol=1e-3 * begin.distance):
+            self.move_to(navigation.overview_pose(self.scene.capture, self._camera.width / self._camera.height))
 
     def _hide_image_if_left(self, camera: Camera) -> None:
         index = self._display.image_index

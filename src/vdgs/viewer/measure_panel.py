@@ -12,6 +12,7 @@ from vdgs.captures.known_distances import MIN_OBSERVATIONS, MOST_APART
 from vdgs.system.quoting import shell_word
 from vdgs.viewer.measurement import SCALE_BAR_FILE, KnownDistance, MeasuredPoint, Ruler, known_distances_text
 from vdgs.viewer.session_protocol import SessionProtocol
+from vdgs.viewer.visitor_work import MeasureWork
 
 _COLOR = (255, 220, 0)
 
@@ -51,6 +52,17 @@ class MeasurePanel:
             self.ruler.clear()
             self._show()
 
+    def work(self) -> MeasureWork:
+        with self._showing:
+            return MeasureWork(tuple(self.ruler.clicked), tuple(self.known), self.is_on)
+
+    def restore(self, work: MeasureWork) -> None:
+        """Go on with the measures of an earlier visit."""
+        with self._showing:
+            self.ruler.clicked, self.known, self._switch.value = list(work.clicked), list(work.known), work.is_on
+            self._show()
+            self._show_command()
+
     def save(self) -> None:
         """Let the browser download all distances that were said to be known, with the one between the clicked places;
         or tell what is missing."""
@@ -67,6 +79,10 @@ class MeasurePanel:
             self.known = [*others, KnownDistance(points[0], points[1], meters)]
             text = known_distances_text(self.known)
             self._session.client.send_file_download(SCALE_BAR_FILE, text.encode(), save_immediately=True)
+            self._show_command()
+
+    def _show_command(self) -> None:
+        if self.known:
             self._command.content = scale_markdown(self.known, self._session.scene.capture.root.name)
 
     def _show(self) -> None:
@@ -78,10 +94,11 @@ class MeasurePanel:
         added: Any = None
         if len(points) == 1:
             radius = 4e-3 * self._session.scene.camera_height
-            added = scene.add_icosphere("/measure", radius, color=_COLOR, position=tuple(points[0]))
+            added = scene.add_icosphere("/measured place", radius, color=_COLOR, position=tuple(points[0]))
         elif len(points) > 1:
             line = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-            added = scene.add_line_segments("/measure", line, _COLOR, thickness=3.0, thickness_units="screen")
+            # Of another name than the place: browsers keep the position of a name.
+            added = scene.add_line_segments("/measured line", line, _COLOR, thickness=3.0, thickness_units="screen")
         self._line = added
 
 

@@ -13,6 +13,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import DEFAULT_FPS, DEFAULT_SECONDS, interpolate
 from vdgs.viewer.navigation import CameraPose
 from vdgs.viewer.session_protocol import SessionProtocol
+from vdgs.viewer.visitor_work import PathWork
 
 #: Frames a second while a path is played.
 _PLAYBACK_FPS = 15.0
@@ -42,6 +43,15 @@ class PathPanel:
         """Make the present view the next key frame."""
         if self._session.camera is not None:
             self.keyframes.append(self._session.camera)
+        self._update_label()
+
+    def work(self) -> PathWork:
+        return PathWork(tuple(self.keyframes), float(self._seconds.value), bool(self._closed.value))
+
+    def restore(self, work: PathWork) -> None:
+        """Go on with the path of an earlier visit."""
+        self.keyframes = list(work.keyframes)
+        self._seconds.value, self._closed.value = work.seconds, work.closed
         self._update_label()
 
     def remove_last(self) -> None:

@@ -15,7 +15,8 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
@@ -39,6 +40,7 @@ from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
 from vdgs.viewer.render_scheduler import RenderScheduler
 from vdgs.viewer.viewer_scene import ViewerScene
+from vdgs.viewer.visitor_work import KeptWork
 
 #: Where the search for a free port begins, and how many are tried.
 FIRST_PORT, MAX_PORT_TRIES = 8080, 50
@@ -46,6 +48,8 @@ FIRST_PORT, MAX_PORT_TRIES = 8080, 50
 MAX_UNSENT_BYTES = 64 << 10
 #: How often a run that trains is looked at, seconds.
 REFRESH_SECONDS = 2.0
+#: The browser (`AccessControl.browser_of`) of the request that is answered; whatever its connection does inherits it.
+_browser: ContextVar[str | None] = ContextVar("browser", default=None)
 
 
 def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], None] | None = None) -> None:
@@ -100,6 +104,27 @@ class ViewerServer:
     scheduler: RenderScheduler
     sessions: dict[int, ClientSession]
     progress: str = ""
+    #: The browsers of the clients, and what their visits left.
+    browsers: dict[int, str | None] = field(default_factory=dict)
+    kept: KeptWork = field(default_factory=KeptWork)
+
+    def welcome(self, session: ClientSession) -> None:
+        """Let a visitor whose connection was lost go on where he was."""
+        work = self.kept.take(self.browsers.get(session.client.client_id))
+        if work is not None:
+            session.restore(work, moves=True)
+
+    def keep(self, session: ClientSession) -> None:
+        """Keep what a visit left. Where the same browser has come back before its loss was noticed, and has made
+        nothing yet, it is handed over at once."""
+        client, work = session.client.client_id, session.work()
+        browser = self.browsers.pop(client, None)
+        for number, other in sorted(self.sessions.items(), reverse=True):
+            is_next = browser is not None and number > client and self.browsers.get(number) == browser
+            if is_next and other.work().is_empty and not work.is_empty:
+                other.restore(work, moves=False)
+                return
+        self.kept.put(browser, work)
 
     def replace_run(self, run: OpenedRun) -> None:
         """Show a newer model to every client."""
@@ -124,11 +149,15 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     viewer = ViewerServer(server=server, access=access, scene=scene, scheduler=scheduler, sessions={})
     _set_initial_camera(server, run)
 
+    async def identify(client: Any) -> None:  # in the connection's own context, before `on_connect`
+        viewer.browsers[client.client_id] = _browser.get()
+
     def on_connect(client: Any) -> None:
         generation = scene.generation
         session = ClientSession(client, scene, scheduler, console)
         viewer.sessions[client.client_id] = session
         session.set_progress(viewer.progress)
+        viewer.welcome(session)
         if scene.generation != generation:  # a newer model came while the panel was made
             session.on_model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
@@ -138,6 +167,9 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
         session = viewer.sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
+            viewer.keep(session)
+        else:
+            viewer.browsers.pop(client.client_id, None)
 
     # What is there by now stays. Left out of all later searches for garbage, it lets them be quick and frequent:
     # visitors who left are held by circles of viser's until one finds them.
@@ -148,6 +180,7 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     worker = threading.Thread(target=scheduler.run, name="render scheduler", daemon=True)
     worker.start()
+    server.on_client_connect(identify)
     server.on_client_connect(on_connect)
     server.on_client_disconnect(on_disconnect)
     try:
@@ -162,7 +195,8 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
 
 
 def _set_initial_camera(server: Any, run: OpenedRun) -> None:
-    """Where a browser stands when it first opens the page; one that connects again stays where it is."""
+    """Where viser lets every new connection stand, in a window at least as wide as high. A session moves on from there:
+    in a narrower window, and where its browser stood before (`ViewerServer.welcome`)."""
     stand, height = navigation.overview_pose(run.capture), camera_height(run.capture)
     start = server.initial_camera
     start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
@@ -301,12 +335,16 @@ def _guard_requests(
             headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
         _limit_send_buffer(connection)
+        browser = access.browser_of(request.headers)
+        _browser.set(browser)
         response = handler(connection, request)
         if response is not None:
             response.headers["Referrer-Policy"] = "no-referrer"
             response.headers["X-Frame-Options"] = "DENY"
             if access.has_token(request.path):
                 response.headers["Set-Cookie"] = access.set_cookie_header()
+            if browser is None:
+                response.headers["Set-Cookie"] = access.set_browser_header()
         return response
 
     return answer
