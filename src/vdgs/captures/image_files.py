@@ -254,8 +254,8 @@ def _in_rgb(path: Path, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
         if 0 < pixels.max() <= _DARK:
             raise CaptureError(
                 f"{path}: has 16 bits a pixel, of which it uses no value above {pixels.max()} of 65535: black, as it "
-                "is. Scale the values of all photographs by one factor, or let MaxSampleValue (tag 281) say "
-                "which value is white."
+                "is. Scale the values of all photographs by one factor, or let MaxSampleValue (tag 281; 4095 for "
+                "12 bits) say which value is white."
             )
         pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if pixels.dtype != np.uint8:

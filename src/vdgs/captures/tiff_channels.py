@@ -51,15 +51,16 @@ def tiff_tags(file: BinaryIO) -> Mapping[int, Any]:
 
 
 def _largest_value(tags: Mapping[int, Any]) -> int:
-    """The value of white in 16 bits: what MaxSampleValue says of a TIFF of 12 bits, or so, a pixel; 65535 else."""
-    said = [value for value in _numbers(tags.get(_LARGEST)) if 255 < value < _WHITE]
+    """The value of white in 16 bits: 4095 where MaxSampleValue says so of a TIFF of 12 bits a pixel, or so; 65535 else.
+    Other values than the largest of some bits are statistics of a picture, of which each has its own (TIFF 6.0)."""
+    said = [value for value in _numbers(tags.get(_LARGEST)) if 255 < value < _WHITE and not value & (value + 1)]
     return max(said, default=_WHITE)
 
 
 def as_tags_say(pixels: np.ndarray, data: np.ndarray) -> np.ndarray:
     """Pixels as OpenCV decodes them; of a TIFF without a fourth channel that is no transparency, and of values whose
     white is below that of 16 bits brought up to it."""
-    tags = tiff_tags(io.BytesIO(data.data))
+    tags = tiff_tags(io.BytesIO(data.data)) if bytes(data[:4]) in _HEADS else {}
     if tags and pixels.ndim == 3 and pixels.shape[2] == 4 and not tiff_has_alpha(tags):
         pixels = np.ascontiguousarray(pixels[..., :3])
     white = _largest_value(tags)
