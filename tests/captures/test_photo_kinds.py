@@ -297,7 +297,7 @@ def test_channels_of_16_bits_one_behind_the_other_are_refused(tmp_path):
 
 
 def test_values_of_12_bits_are_scaled_by_the_white_that_their_tag_says(tmp_path):
-    """4095 is the white of 12 bits; other values are the largest of a picture: by them each would be scaled otherwise."""
+    """4095 is the white of 12 bits; other values are the largest of a picture: by those scales differ."""
     values = ((patches()[..., 0].astype(np.uint32) * 4095 + 127) // 255).astype(np.uint16)
     Image.fromarray(values).save(tmp_path / "a.tif", tiffinfo={281: 4095})
     assert np.abs(middles(decode_image(tmp_path / "a.tif")[0])[:, 0] - COLORS[:, 0]).max() <= 1
