@@ -1,6 +1,6 @@
 """Discards what image libraries say about files on their own: errors come as exceptions, and are said in our words.
 
-libjpeg and libpng write to the file descriptor of standard error. While at least one thread decodes, the descriptor
+libjpeg, libpng and OpenCV write to the file descriptor of standard error. While at least one thread decodes, the descriptor
 leads into a temporary file; afterwards the lines of others in this file are written to standard error.
 """
 
@@ -18,7 +18,8 @@ from typing import IO
 STDERR = 2
 _THEIRS = re.compile(
     rb"^(Corrupt JPEG data|Premature end of JPEG|Invalid SOS parameters|Inconsistent progression sequence"
-    rb"|Unknown Adobe color|Warning: unknown JFIF|Application transferred too|libpng (warning|error)).*\n?",
+    rb"|Unknown Adobe color|Warning: unknown JFIF|Application transferred too|libpng (warning|error)"
+    rb"|\[ ?(WARN|ERROR):\S*\] global ).*\n*",  # OpenCV, of files
     re.MULTILINE,
 )
 _lock, _threads = threading.Lock(), 0
