@@ -118,7 +118,7 @@ def sfm_command(arguments: list[str]) -> None:
         image_folders=args.images, output=args.output, gps=args.gps, threads=args.threads,
         keep_intermediate=args.keep_intermediate, overwrite=args.overwrite, options=args.options,
     )  # fmt: skip
-    console = make_console(args.quiet)
+    console = make_console(args.quiet and not args.dry_run)
     options = CaptureOptions(images=args.project_images)
     is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
     if args.project_images is not None and not is_posed and not any(map(is_capture, args.images)):

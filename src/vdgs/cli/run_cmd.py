@@ -26,7 +26,7 @@ from vdgs.config.ranges import FlagName, Positional, check_ranges
 from vdgs.system.quoting import shell_word
 
 #: Options that the command in config.yaml leaves out: they belong to one start.
-NOT_KEPT = ("--overwrite", "--quiet")
+NOT_KEPT = ("--overwrite", "--quiet", "--dry-run")
 
 #: The sections of settings of what comes after the coarse stage.
 LATER_SECTIONS = ("partition", "assignment", "block", "merge")
@@ -113,12 +113,11 @@ def run_command(arguments: list[str]) -> None:
     args: RunArguments = given.over(start.layer())
     check_ranges(args)
     console, command = make_console(args.quiet and not args.dry_run), given.command_line("run", NOT_KEPT)
-    if not args.dry_run:
-        from vdgs.pipeline.finished_run import nothing_to_do
+    from vdgs.pipeline.finished_run import nothing_to_do
 
-        if done := nothing_to_do(args, command, [args.config] if args.config else []):
-            console.print(done, markup=False, highlight=False)
-            return
+    if done := nothing_to_do(args, command, [args.config] if args.config else []):
+        console.print(done, markup=False, highlight=False)
+        return
     if start.reason:
         console.print(f"preset: {start.reason}", highlight=False)
     request = replace(args, device=set_up_compute(args.device, args.threads))

@@ -6,6 +6,7 @@ photographs alone three are searched and matched, and the steps are those of a s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from rich.console import Console
@@ -25,12 +26,18 @@ from vdgs.pipeline.run_estimate import RunEstimate
 from vdgs.runs.config_file import changed_flags
 from vdgs.runs.create_or_resume import capture_options_changed, run_settings
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_status import RunStatus, get_run_status
+from vdgs.runs.run_status import RunStatus, StageStatus, get_run_status
 from vdgs.sfm.films.take_frames import temporary_frames
 from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 from vdgs.sfm.reconstruct import describe_work_left, look_at_work
 from vdgs.sfm.reconstruction_plan import print_plan
-from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request, size_apart
+from vdgs.sfm.run_request import (
+    is_image_input,
+    make_posed_request,
+    make_sfm_request,
+    print_unused_options,
+    size_apart,
+)
 from vdgs.sfm.sfm_estimate import estimate_sfm
 from vdgs.system.atomic_files import read_json
 from vdgs.system.units import data_size, rough_duration
@@ -53,6 +60,7 @@ def estimate_run(request: RunRequest, console: Console) -> RunEstimate:
     posed, size = size_apart(request)
     if lacks_points(posed.capture, posed.options):
         return _estimate_from_poses(posed, size, console)
+    print_unused_options(request, console)
     return _estimate_from_capture(request, console)
 
 
@@ -145,11 +153,11 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus |
         f"{takes('blocks')}{done(*names)}",
         f"measuring, maps, report: about {takes('measuring', 'maps', 'other')}",
         f"memory that is free: {data_size(plan.free_bytes)}",
-        f"the whole job: {plan.text()}",
+        f"{'the whole job' if status is None else 'what is left of the job'}: {_left(plan, status).text()}",
         f"Measured now on this machine: training steps at each size{', stereo' if plan.dense_points else ''}"
         f"{', features and matches of three photographs' if 'photographs' in plan.times else ''}. Anchors are taken to "
-        f"grow {coarse_growth:.2g} times in the coarse model and {block_growth:.2g} times in blocks. No run was "
-        "begun.",
+        f"grow {coarse_growth:.2g} times in the coarse model and {block_growth:.2g} times in blocks. Nothing was "
+        "written.",
     ]
     console.print("\n".join(lines), highlight=False)
     if plan.may_exceed_memory:
@@ -158,3 +166,25 @@ def _print_estimate(plan: RunEstimate, method: MethodConfig, status: RunStatus |
             "--jobs",
             highlight=False,
         )
+
+
+def _left(plan: RunEstimate, status: RunStatus | None) -> RunEstimate:
+    """The estimate without what a run has done; of what trains, in proportion to the iterations."""
+    if status is None:
+        return plan
+    coarse, blocks = _share_left([status.of("coarse")]), _share_left(status.blocks)
+    shares = {"stereo": float(coarse == 1), "coarse": coarse, "motion": float(blocks > 0), "blocks": blocks}
+    return replace(plan, times={name: cost * shares.get(name, 1.0) for name, cost in plan.times.items()})
+
+
+def _share_left(stages: Sequence[StageStatus]) -> float:
+    """What is left of stages that train, of 1; 1 where there are none yet."""
+    left = [1.0 - _progress(stage) for stage in stages]
+    return sum(left) / len(left) if left else 1.0
+
+
+def _progress(stage: StageStatus) -> float:
+    if stage.state == "done":
+        return 1.0
+    told = stage.status if stage.state in ("running", "stopped", "failed") else None
+    return told.iteration / told.iterations if told is not None and told.iteration and told.iterations else 0.0

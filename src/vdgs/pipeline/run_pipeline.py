@@ -36,7 +36,13 @@ from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
-from vdgs.sfm.run_request import is_image_input, make_posed_request, make_sfm_request, size_apart
+from vdgs.sfm.run_request import (
+    is_image_input,
+    make_posed_request,
+    make_sfm_request,
+    print_unused_options,
+    size_apart,
+)
 from vdgs.sfm.sfm_estimate import SfmEstimate
 from vdgs.system.atomic_files import read_json
 from vdgs.system.documents import EvaluationMetrics
@@ -99,6 +105,7 @@ def _find_points(run_request: RunRequest, console: Console) -> RunRequest:
     RUN/capture first."""
     posed, size = size_apart(run_request)
     if not lacks_points(posed.capture, posed.options):
+        print_unused_options(run_request, console)
         return run_request
     from vdgs.sfm.posed_capture import make_posed_capture  # imports much that a run of a capture does not need
 

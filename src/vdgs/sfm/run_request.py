@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
+
 from vdgs.captures.capture_root import capture_root
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
-from vdgs.config.sfm_options import SfmRequest
+from vdgs.config.ranges import to_flag
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm.capture_writer import IMAGE_SIZES
@@ -52,6 +56,18 @@ def size_apart(request: RunRequest) -> tuple[RunRequest, str | None]:
     if Path(named).is_dir() or (capture_root(request.capture) / named).is_dir():
         return request, None
     return replace(request, options=replace(request.options, images=None)), named
+
+
+def print_unused_options(request: RunRequest, console: Console) -> None:
+    """Say which options about poses have no effect, because the capture has its own."""
+    plain = SfmOptions()
+    changed = [to_flag(("sfm", name)) for name, value in vars(request.sfm).items() if value != getattr(plain, name)]
+    if changed:
+        console.print(
+            f"[yellow]note[/] {', '.join(changed)}: without effect, for {escape(str(request.capture))} has its poses. "
+            "They are for photographs alone.",
+            highlight=False,
+        )
 
 
 def make_posed_request(request: RunRequest) -> SfmRequest:

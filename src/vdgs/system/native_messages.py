@@ -1,7 +1,7 @@
 """Discards what image libraries say about files on their own: errors come as exceptions, and are said in our words.
 
-libjpeg, libpng and OpenCV write to the file descriptor of standard error. While at least one thread decodes, the descriptor
-leads into a temporary file; afterwards the lines of others in this file are written to standard error.
+libjpeg, libpng and OpenCV write to the file descriptor of standard error. While at least one thread decodes, the
+descriptor leads into a temporary file; afterwards the lines of others in this file are written to standard error.
 """
 
 from __future__ import annotations
