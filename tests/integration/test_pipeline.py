@@ -219,10 +219,15 @@ def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
 
 
 def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):
+    whole = vdgs("run", capture, "--output", copied, *SETTINGS, "--dry-run")
+    assert whole.stdout.startswith("nothing to do"), whole.stderr
+    shutil.rmtree(copied / "merged")
     before = moments(copied)
     for output, done in ((copied, True), (tmp_path / "new", False)):
-        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run")
+        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run", "--sfm.focal", "refine")
         assert planned.returncode == 0, planned.stderr
+        assert "--sfm.focal: without effect" in planned.stdout
+        assert ("what is left of the job: " in planned.stdout) is done
         assert f"{ITERATIONS} iterations" in planned.stdout
         assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
         assert planned.stdout.count("done already") == 2 * done

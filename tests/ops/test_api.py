@@ -323,7 +323,7 @@ def test_a_callback_ends_a_stage(run, capture):
 
     def stop(event):
         seen.append(event.iteration)
-        return event.iteration == 3
+        return np.float64(event.iteration) == 3  # numpy's True
 
     scene = vdgs.train(capture, run.settings.training, callbacks=[stop])
     assert seen == [1, 2, 3]

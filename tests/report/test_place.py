@@ -132,6 +132,13 @@ def test_maps_of_another_model_are_not_shown_as_the_place(tmp_path):
     assert "There is no orthophoto of this model yet" in text
 
 
+def test_maps_from_levels_of_detail_are_called_so(tmp_path):
+    run = run_of(tmp_path / "run", place_of(tmp_path / "beach", GEOREF))
+    file = run.path / "maps/map.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"lod_error": 0.5}))
+    assert page_of(run)[1].count("drawn from levels of detail (off by 0.5 px at most)") == 2
+
+
 def test_status_says_the_same(tmp_path):
     place = place_of(tmp_path / "beach", GEOREF)
     run, stream = run_of(tmp_path / "run", place), io.StringIO()

@@ -149,7 +149,8 @@ def _run(state: TrainingState, problem: TrainingProblem, stage: str, callbacks: 
             psnr=state.psnr, anchors=len(state.anchors),
         )  # fmt: skip
         for callback in callbacks:
-            ends = callback(event) is True or ends
+            answer = callback(event)
+            ends = (isinstance(answer, bool | np.bool_) and bool(answer)) or ends
 
     train(state, problem, stop=lambda: ends, after_step=after_step)
 

@@ -39,6 +39,12 @@ def current_map(report: ReportedRun, source: RunFiles) -> JsonRecord:
     return JsonRecord({})
 
 
+def levels_of(metadata: JsonRecord) -> str:
+    """What to say of maps that were drawn from levels of detail; empty for those in full detail."""
+    error = metadata.number("lod_error")
+    return "" if error is None else f", drawn from levels of detail (off by {error:g} px at most)"
+
+
 def place_panel(report: ReportedRun, source: RunFiles, facts: PlaceFacts | None) -> Html:
     """The orthophoto with scale bar and north, and beside it the facts."""
     metadata = current_map(report, source)
@@ -69,7 +75,7 @@ def _map_figure(image: EmbeddedImage, metadata: JsonRecord, facts: PlaceFacts | 
         bar = Overlay(f"{length:g} {unit}", 100 * length / (gsd * width))
     is_known = facts is not None and facts.latitudes is not None
     is_north_up = is_known and metadata.text("crs") != "source"
-    caption = f"Orthophoto, {metadata.text('crs_name')}."
+    caption = f"Orthophoto, {metadata.text('crs_name')}{levels_of(metadata)}."
     if not is_north_up:
         caption += " The direction of north is not known."
     return map_figure(image, caption, "orthophoto of the place", bar, "N" if is_north_up else None)

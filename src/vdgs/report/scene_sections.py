@@ -15,7 +15,7 @@ from vdgs.captures.reconstruction import (
     report_rows,
 )
 from vdgs.report.html_page import Html, details, figure, heading, join_html, link, paragraph, section, table
-from vdgs.report.place_section import MAP_FILE, current_map
+from vdgs.report.place_section import MAP_FILE, current_map, levels_of
 from vdgs.report.run_reader import JsonRecord, ReportedRun, RunFiles, format_percent
 from vdgs.runs.run_folder import MOTION_EXAMPLES, MOTION_FILE
 from vdgs.system.records import record_from_dict
@@ -231,7 +231,8 @@ def ortho_section(report: ReportedRun) -> Html:
             paragraph(
                 f"Orthophoto, surface model and visibility in {metadata.text('crs_name')}"
                 + (f", pixels of {format_length(gsd, unit)}" if gsd else "")
-                + ": GeoTIFFs in maps/. Blank is what is not solid, or what no training photograph shows."
+                + f"{levels_of(metadata)}: GeoTIFFs in maps/. Blank is what is not solid, or what no training "
+                "photograph shows."
             ),
             figure(source.image("maps/preview.png"), "The scene as maps.", "maps of the scene", True),
         ]
