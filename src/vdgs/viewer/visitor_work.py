@@ -160,7 +160,7 @@ class Visits:
         for number, other in sorted(self._visits.items()):
             is_later = number > client and other.began >= earliest
             is_same = visit.browser is not None and other.browser == visit.browser
-            is_new = other.session is not None and not other.was_handed_work
-            if is_later and is_same and is_new and other.session.work().is_empty:
+            is_new = other.session is not None and not other.was_handed_work and other.session.work().is_empty
+            if is_later and is_same and is_new:
                 return other
         return None
