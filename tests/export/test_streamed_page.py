@@ -45,7 +45,7 @@ def test_a_browser_asks_whether_what_it_holds_is_still_right(tmp_path):
     registry.write_scene(tmp_path / "scene.json", ExportScene.of(random_gaussians(20, 0)))
     page = (tmp_path / "index.html").read_text()
     assert 'FRESH = { cache: "no-cache" }' in page
-    assert re.findall(r"fetch\(([^)]*)\)", page) == ['"scene.json", FRESH', "node.uri, FRESH"]
+    assert re.findall(r"fetch\(([^)]*)\)", page) == ["uri, FRESH"]
 
 
 def test_a_page_of_others_stays(tmp_path):
