@@ -88,7 +88,7 @@ def test_the_page_shows_what_we_draw_and_loads_what_is_near(tmp_path):
     (tmp_path / scene["root"]["content"]["uri"]).unlink()
     with served(tmp_path) as address, open_page(address, SIZE, SIZE) as page:
         wait_until(lambda: state(page) == "failed")
-        assert "copy it whole" in page.evaluate("document.body.innerText")
+        assert "are missing (404): copy it whole" in page.evaluate("document.body.innerText")
 
 
 def test_a_server_that_is_away_for_a_while_is_asked_again_and_a_lost_graphics_card_is_said(tmp_path):
@@ -97,6 +97,7 @@ def test_a_server_that_is_away_for_a_while_is_asked_again_and_a_lost_graphics_ca
     scene = replace(ExportScene.of(random_gaussians(600, 0)), page=view)
     write_streamed_page(tmp_path / "scene.json", scene, node_size=100)
     move = "canvas.dispatchEvent(new WheelEvent('wheel', {deltaY: -9000, cancelable: true}))"
+    beside = "for (let i = 0; i < 100; i++) canvas.dispatchEvent(new KeyboardEvent('keydown', {{key: 'Arrow{}'}}))"
 
     def told(page) -> tuple[str, str]:
         state, caption = page.evaluate("[document.body.dataset.state, caption.textContent]")
@@ -116,9 +117,28 @@ def test_a_server_that_is_away_for_a_while_is_asked_again_and_a_lost_graphics_ca
         assert told(page)[0] == "loading"
         before = page.evaluate("asked")
         wait_until(lambda: page.evaluate("asked") > before)  # by itself
+        # Beside the scene nothing is wanted: nothing is amiss.
+        page.evaluate(beside.format("Up"))
+        wait_until(lambda: told(page)[0] == "complete")
+        assert "connection" not in told(page)[1]
+        page.evaluate(beside.format("Down"))
+        wait_until(lambda: "no connection; trying again" in told(page)[1])
         page.evaluate("window.fetch = plain")
         wait_until(lambda: told(page)[0] == "complete")
         assert "parts" in told(page)[1]
+        # Only what passes is asked again: stores of objects say 403 of files that are not there.
+        passing, lasting = [408, 425, 429, 500, 503], [400, 401, 403, 410]
+        page.evaluate(
+            "window.answers = [];"
+            f"for (const status of {passing + lasting}) {{"
+            "  window.fetch = async () => new Response('', {status});"
+            "  get('a.bin', 'json').then(found => answers.push([status, found === null ? '' : 'found']),"
+            "                            error => answers.push([status, error.message])); }"
+        )
+        wait_until(lambda: len(page.evaluate("answers")) == len(passing + lasting))
+        answers = dict(page.evaluate("answers"))
+        assert sorted(status for status, text in answers.items() if not text) == passing
+        assert answers[403] == "a.bin: 403. Copy the folder whole, or let the server show it."
         page.evaluate("canvas.getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()")
         wait_until(lambda: told(page)[0] == "failed")
         page.evaluate(move)

@@ -46,7 +46,6 @@ def test_a_browser_asks_whether_what_it_holds_is_still_right(tmp_path):
     page = (tmp_path / "index.html").read_text()
     assert 'FRESH = { cache: "no-cache" }' in page
     assert re.findall(r"fetch\(([^)]*)\)", page) == ["uri, FRESH"]
-    assert re.findall(r"get\(([^)]*), \"\w+\"\)", page) == ['"scene.json"', "node.uri"]
 
 
 def test_a_page_of_others_stays(tmp_path):

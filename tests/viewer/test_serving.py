@@ -188,7 +188,7 @@ def leaves_work(viewer: ViewerServer, guest: Guest) -> None:
 
 
 @quiet
-def test_what_a_visitor_made_outlives_a_lost_connection(viewer):
+def test_what_a_visitor_made_outlives_a_lost_connection(viewer, monkeypatch):
     """And nobody else gets it, whoever comes first."""
     wait_until(lambda: not viewer.sessions)
     address = viewer.access.local_url()
@@ -198,10 +198,18 @@ def test_what_a_visitor_made_outlives_a_lost_connection(viewer):
     leaves_work(viewer, guest)
     guest.vanish()
     wait_until(lambda: not viewer.sessions)
+    welcome, welcomed = viewer.visits.welcome, list[ClientSession]()
+
+    def seen_to_welcome(session: ClientSession) -> None:
+        welcome(session)
+        welcomed.append(session)
+
+    monkeypatch.setattr(viewer.visits, "welcome", seen_to_welcome)
     for headers in (theirs, None, mine):
         guest = Guest(address, headers)
         guest.stand(above())
-        visitor = newest(viewer)
+        wait_until(lambda: welcomed)
+        visitor = welcomed.pop()
         measures = visitor.point_panel.measure_panel
         if headers is mine:
             wait_until(lambda visitor=visitor: np.allclose(visitor.pose.position, above(1.0, 0.5).position))

@@ -40,7 +40,7 @@ from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
 from vdgs.viewer.render_scheduler import RenderScheduler
 from vdgs.viewer.viewer_scene import ViewerScene
-from vdgs.viewer.visitor_work import KeptWork
+from vdgs.viewer.visitor_work import Visits
 
 #: Where the search for a free port begins, and how many are tried.
 FIRST_PORT, MAX_PORT_TRIES = 8080, 50
@@ -104,27 +104,7 @@ class ViewerServer:
     scheduler: RenderScheduler
     sessions: dict[int, ClientSession]
     progress: str = ""
-    #: The browsers of the clients, and what their visits left.
-    browsers: dict[int, str | None] = field(default_factory=dict)
-    kept: KeptWork = field(default_factory=KeptWork)
-
-    def welcome(self, session: ClientSession) -> None:
-        """Let a visitor whose connection was lost go on where he was."""
-        work = self.kept.take(self.browsers.get(session.client.client_id))
-        if work is not None:
-            session.restore(work, moves=True)
-
-    def keep(self, session: ClientSession) -> None:
-        """Keep what a visit left. Where the same browser has come back before its loss was noticed, and has made
-        nothing yet, it is handed over at once."""
-        client, work = session.client.client_id, session.work()
-        browser = self.browsers.pop(client, None)
-        for number, other in sorted(self.sessions.items(), reverse=True):
-            is_next = browser is not None and number > client and self.browsers.get(number) == browser
-            if is_next and other.work().is_empty and not work.is_empty:
-                other.restore(work, moves=False)
-                return
-        self.kept.put(browser, work)
+    visits: Visits = field(default_factory=Visits)
 
     def replace_run(self, run: OpenedRun) -> None:
         """Show a newer model to every client."""
@@ -150,14 +130,14 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     _set_initial_camera(server, run)
 
     async def identify(client: Any) -> None:  # in the connection's own context, before `on_connect`
-        viewer.browsers[client.client_id] = _browser.get()
+        viewer.visits.begin(client.client_id, _browser.get())
 
     def on_connect(client: Any) -> None:
         generation = scene.generation
         session = ClientSession(client, scene, scheduler, console)
         viewer.sessions[client.client_id] = session
         session.set_progress(viewer.progress)
-        viewer.welcome(session)
+        viewer.visits.welcome(session)
         if scene.generation != generation:  # a newer model came while the panel was made
             session.on_model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
@@ -167,9 +147,7 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
         session = viewer.sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
-            viewer.keep(session)
-        else:
-            viewer.browsers.pop(client.client_id, None)
+        viewer.visits.end(client.client_id)
 
     # What is there by now stays. Left out of all later searches for garbage, it lets them be quick and frequent:
     # visitors who left are held by circles of viser's until one finds them.
@@ -196,7 +174,7 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
 
 def _set_initial_camera(server: Any, run: OpenedRun) -> None:
     """Where viser lets every new connection stand, in a window at least as wide as high. A session moves on from there:
-    in a narrower window, and where its browser stood before (`ViewerServer.welcome`)."""
+    in a narrower window, and where its browser stood before (`Visits.welcome`)."""
     stand, height = navigation.overview_pose(run.capture), camera_height(run.capture)
     start = server.initial_camera
     start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
