@@ -37,7 +37,8 @@ _PILLOW_LIMITS = _PillowLimits()
 
 @contextmanager
 def pillow_without_limits() -> Iterator[None]:
-    """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is `image_files.MAX_IMAGE_PX`), in the whole process until the last that entered it, in whatever thread, has left.
+    """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is
+    `image_files.MAX_IMAGE_PX`), in the whole process until the last that entered it, in whatever thread, has left.
     """
     _PILLOW_LIMITS.lift()
     try:
