@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.config.method import DensifyConfig, MethodConfig, TrainConfig
+from vdgs.config.method import DensifyConfig, MethodConfig, TrainConfig, scaled_growth_start
 from vdgs.config.presets import PRESETS, PresetName
 
 #: In the run folder: state, key, provenance, seconds of each stage.
@@ -67,7 +67,7 @@ def scaled_growth(growth: DensifyConfig, iterations: int, scale: float) -> Densi
     return replace(
         growth,
         stats_start=round(scale * growth.stats_start),
-        start=round(scale * growth.start),
+        start=scaled_growth_start(growth, scale),
         every=min(growth.every, interval) if scale < 1 else growth.every,
     )
 

@@ -16,7 +16,9 @@ from PIL import Image, TiffImagePlugin
 
 from support.commands import PATIENCE_SECONDS
 from vdgs.captures.formats.source_capture import Intrinsics
-from vdgs.captures.image_files import decode_image, pillow_without_limits, verify_image
+from vdgs.captures.image_files import decode_image, read_header, verify_image
+from vdgs.captures.jpeg import lacks_only_end
+from vdgs.captures.pillow_limits import pillow_without_limits
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.errors import CaptureError
 from vdgs.system.native_messages import without_decoder_messages
@@ -95,17 +97,20 @@ def test_limits_of_pillow_return_once_the_last_thread_has_left():
     assert (Image.MAX_IMAGE_PIXELS, list(warnings.filters)) == before
 
 
-@pytest.mark.parametrize("kind", ["jpg", "jpg without its end", "png", "unknown to OpenCV"])
+@pytest.mark.parametrize("kind", ["jpg", "jpg without its end", "png", "tif", "unknown to OpenCV"])
 @pytest.mark.filterwarnings("error")
 def test_pictures_beyond_the_limits_of_pillow_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
     """Aerial cameras have 150 megapixels; Pillow warns from 89 on and refuses twice as many."""
-    file = tmp_path / f"a.{'jpg' if kind.startswith('jpg') else 'png'}"
+    file = tmp_path / f"a.{kind[:3] if kind != 'unknown to OpenCV' else 'png'}"
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(file)
     if kind == "jpg without its end":
         file.write_bytes(file.read_bytes()[:-2])
     if kind == "unknown to OpenCV":
         monkeypatch.setattr("cv2.imdecode", lambda *_: None)
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    for limit in (1000, 2000):  # refused, and warned of
+        monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
+        assert read_header(file).width == 64
+        assert lacks_only_end(file) == kind.startswith("jpg")
     assert verify_image(file).has_content
     assert decode_image(file)[0].shape == (48, 64, 3)
     lens = Intrinsics("SIMPLE_RADIAL", (60.0, 32.0, 24.0, -0.05), 64, 48)

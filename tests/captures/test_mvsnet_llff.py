@@ -18,6 +18,7 @@ from vdgs.captures.formats.mvsnet import read_mvsnet
 from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import check_output
+from vdgs.cli.capture_cmds import sfm_command
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm.image_list import collect_images
@@ -92,6 +93,37 @@ def test_shrunk_photographs_have_the_lens_of_their_size(tmp_path, scene, kind):
         assert (camera.width, camera.height) == (first.width // 4, first.height // 4)
         assert (camera.fx, camera.cx) == pytest.approx((first.fx / 4, first.cx / 4))
     assert load_capture(tmp_path).images == "images_4"
+
+
+@pytest.mark.parametrize("kind", ["mvsnet", "llff"])
+def test_photographs_lie_in_the_root(tmp_path, scene, kind):
+    expected = write_any(tmp_path, scene, kind)
+    folder = tmp_path / ("blended_images" if kind == "mvsnet" else "images")
+    for file in folder.iterdir():
+        file.rename(tmp_path / file.name)
+    folder.rmdir()
+    assert lacks_points(tmp_path, CaptureOptions())
+    write_ply(tmp_path / "points3D.ply", scene.points, scene.colors)
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert capture.images == "."
+    assert_sees_the_scene(capture, expected)
+    assert cameras_of(read_source(tmp_path, CaptureOptions(images="."))) == [view.name for view in capture.views]
+
+
+@pytest.mark.parametrize("kind", ["mvsnet", "llff"])
+def test_poses_that_cannot_be_used_are_no_dead_end(tmp_path, scene, kind):
+    """As of photographs that were added, or of files of others by the same name; the remedy leads on."""
+    write_any(tmp_path, scene, kind)
+    images = tmp_path / ("blended_images" if kind == "mvsnet" else "images")
+    if kind == "llff":
+        next(images.iterdir()).unlink()
+    else:
+        for file in (tmp_path / "cams").iterdir():
+            file.write_text("something else")
+    with pytest.raises(CaptureError, match=r"\nTo make new poses .* a folder of them without poses"):
+        sfm_command([str(tmp_path), "--output", str(tmp_path / "made")])
+    with pytest.raises(CaptureError, match="a scene needs 3"):  # their size is all that is wrong with these
+        sfm_command([str(images), "--output", str(tmp_path / "made")])
 
 
 @pytest.mark.parametrize("kind", ["mvsnet", "llff"])

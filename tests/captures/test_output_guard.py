@@ -205,6 +205,17 @@ def test_a_file_that_nobody_takes_for_a_photograph_may_lie_among_some(tmp_path: 
     assert is_refused(tmp_path / "DCIM" / "100MEDIA" / "scene.html")
 
 
+@pytest.mark.parametrize("poses", ["transforms.json", "poses_bounds.npy"])
+def test_points_beside_the_photographs_in_a_root_would_be_those_of_the_capture(tmp_path: Path, poses: str) -> None:
+    root = photographs(tmp_path / "set", 3)
+    (root / poses).touch()
+    for name in ("scene.ply", "points3D.PLY", "x.las", "x.laz"):
+        with pytest.raises(VdgsError, match=rf"taken for the capture's points.*{tmp_path / name}$"):
+            check_output(root / name)
+    for free in ("scene.html", "x.spz", "export/scene.ply"):
+        assert not is_refused(root / free), free
+
+
 def test_a_few_pictures_are_no_photographs(tmp_path: Path) -> None:
     figures = photographs(tmp_path / "figures", 2)
     assert not is_refused(figures)

@@ -330,7 +330,10 @@ def test_what_is_no_tensor_is_named():
 
 def test_cameras_that_would_be_misread_are_named():
     given = scene()
+    second = torch.arange(len(given["Ks"]))[:, None, None] == 1
     for name, wrong, message in (
+        ("Ks", given["Ks"].masked_fill(second, torch.inf), "^Ks hold what is no finite number"),
+        ("viewmats", given["viewmats"].masked_fill(second, torch.nan), "^viewmats hold what is no finite number"),
         ("Ks", given["Ks"].transpose(-1, -2), "^Ks have their translation in the last row: transpose them"),
         ("viewmats", given["viewmats"].transpose(-1, -2), "^viewmats have their translation in the last row"),
         ("Ks", given["Ks"] * torch.nan, "^Ks hold what is no finite number"),

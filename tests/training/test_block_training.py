@@ -14,7 +14,9 @@ from vdgs.config.method import (
     DensifyConfig,
     MethodConfig,
     block_train_config,
+    scaled_growth_start,
 )
+from vdgs.config.presets import PRESETS
 from vdgs.model.anchors import Anchors
 from vdgs.model.renderer import cull_anchors
 from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
@@ -199,6 +201,14 @@ def test_a_cycle_lasts_from_decision_to_decision():
     assert len(views_in_cycle(6, late)) == 2  # the statistics began after the cycle would have
     assert len(views_in_cycle(12, stage)) == 3  # steps 10 to 12, within one epoch, which has no view twice
     assert not {*views_in_cycle(12, stage)} & {*views_in_cycle(15, stage)}
+
+
+@pytest.mark.parametrize("scale", [0.004, 0.2, 0.25, 0.6, 1.0, 2.0, 2.4])
+def test_growth_begins_on_the_same_side_of_a_decision_however_long_a_block_trains(scale: float):
+    """Preset `paper` leaves out the decision on which `default` begins."""
+    begins = PRESETS["default"].block.densify.start * scale
+    starts = [scaled_growth_start(PRESETS[name].block.densify, scale) for name in ("default", "paper")]
+    assert starts == [round(begins), round(begins) + 1]
 
 
 def test_rates_and_growth_restart_and_iterations_scale():

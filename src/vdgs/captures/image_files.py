@@ -7,10 +7,8 @@ verbs decode it by `decode_image`, to sRGB.
 from __future__ import annotations
 
 import io
-import threading
-import warnings as python_warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +29,7 @@ from vdgs.captures.image_suffixes import (
 from vdgs.captures.jpeg import JPEGS, has_end, lacks_only_end, with_end
 from vdgs.captures.name_resolution import find_file
 from vdgs.captures.optional_decoders import has_decoder, prepare_heif
+from vdgs.captures.pillow_limits import pillow_without_limits
 from vdgs.captures.raw_files import develop, is_raw, raw_size
 from vdgs.captures.strays import is_hidden
 from vdgs.captures.tiff_channels import as_tags_say, has_alpha_channel, why_no_picture
@@ -78,43 +77,6 @@ class ImageHeader:
     width: int
     height: int
     mode: str
-
-
-class _PillowLimits:
-    """The limits of Pillow in this process, and how many callers, in whatever threads, do without them."""
-
-    def __init__(self) -> None:
-        self._lock, self._callers, self._restore = threading.Lock(), 0, ExitStack()
-
-    def lift(self) -> None:
-        with self._lock:
-            self._callers += 1
-            if self._callers == 1:
-                self._restore.enter_context(python_warnings.catch_warnings())
-                python_warnings.simplefilter("ignore")
-                self._restore.callback(setattr, Image, "MAX_IMAGE_PIXELS", Image.MAX_IMAGE_PIXELS)
-                Image.MAX_IMAGE_PIXELS = None
-
-    def restore(self) -> None:
-        with self._lock:
-            self._callers -= 1
-            if not self._callers:
-                self._restore.close()
-
-
-_PILLOW_LIMITS = _PillowLimits()
-
-
-@contextmanager
-def pillow_without_limits() -> Iterator[None]:
-    """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is judged
-    below), in the whole process until the last that entered it, in whatever thread, has left.
-    """
-    _PILLOW_LIMITS.lift()
-    try:
-        yield
-    finally:
-        _PILLOW_LIMITS.restore()
 
 
 @contextmanager
@@ -319,9 +281,8 @@ def _decode(path: Path) -> np.ndarray:
     try:
         return _decode_bytes(path, data)
     except CaptureError:
-        with pillow_without_limits():
-            if not lacks_only_end(path):
-                raise
+        if not lacks_only_end(path):
+            raise
     return _decode_bytes(path, np.frombuffer(with_end(path).getvalue(), np.uint8))
 
 

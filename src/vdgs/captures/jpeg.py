@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from vdgs.captures.pillow_limits import pillow_without_limits
+
 #: Pillow's names for JPEGs: MPO holds several pictures, a photograph and its preview (current drones, phones).
 JPEGS = {"JPEG", "MPO"}
 #: The end marker is looked for in so many bytes before the end, where only trailing data of makers may follow it.
@@ -54,7 +56,7 @@ def _without_half(data: bytes) -> bytes:
 
 
 def _pixels(data: bytes) -> np.ndarray:
-    with Image.open(io.BytesIO(data), formats=["JPEG"]) as image:
+    with pillow_without_limits(), Image.open(io.BytesIO(data), formats=["JPEG"]) as image:
         return np.asarray(image)
 
 

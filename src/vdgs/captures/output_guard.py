@@ -9,7 +9,8 @@ does the work, for those who call it from Python. What is allowed:
 - anything in a run but the folders of its stages, and in a capture but its inputs, wherever the run or capture lies;
 - a new folder in a capture whose photographs lie in its root (no file there);
 - a folder of results (a render, maps): they are no photographs (`strays.why_not_read`);
-- a file that nobody takes for a photograph (a page, a file of Gaussians or points), but in what a camera fills.
+- a file that nobody takes for a photograph (a page, a file of Gaussians or points), but in what a camera fills, nor
+  points where a capture with photographs in its root looks for its own.
 """
 
 from __future__ import annotations
@@ -46,6 +47,8 @@ _MEGA_NERF = ("rgbs", "metadata")
 _CAMERA_FOLDER = "dcim"
 #: Endings of single files that cannot be taken for photographs and hold none beside them.
 _NO_PICTURES = {".html", ".ply", ".spz", ".splat", ".sog", ".rad", ".glb", ".laz", ".las"}
+#: Those that hold points, or Gaussians, which are read as such.
+_POINTS = {".ply", ".laz", ".las"}
 #: So many pictures are photographs, whatever they say of themselves: with fewer there is no scene (`sfm.image_list`).
 _MANY_PICTURES = 3
 
@@ -59,6 +62,7 @@ def check_output(output: Path) -> None:
     """
     real = Path(os.path.realpath(output))
     _check_not_in_capture(output, real)
+    _check_no_points(output, real)
     found = [folder for folder in _folders_around(real) if _holds_photographs(folder, real)]
     if found:
         raise VdgsError(
@@ -92,6 +96,17 @@ def _check_not_in_capture(output: Path, real: Path) -> None:
             raise _error(output, folder, parent)
         if folder.name in _MEGA_NERF and is_mega_nerf(parent.parent):
             raise _error(output, folder, parent.parent)
+
+
+def _check_no_points(output: Path, real: Path) -> None:
+    root = real.parent
+    if real.suffix.lower() not in _POINTS or real.is_dir() or not is_capture(root):
+        return
+    if _holds_photographs(root, root):
+        raise VdgsError(
+            f"{output}: lies in the root of the capture {root}, where it would be taken for the capture's points. "
+            f"Nothing was written. Choose a folder outside of it, such as {_place_beside(root, real)}"
+        )
 
 
 def _folders_around(real: Path) -> list[Path]:

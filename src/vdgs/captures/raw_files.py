@@ -17,6 +17,7 @@ from PIL import Image
 
 from vdgs.captures.image_suffixes import RAW_SUFFIXES
 from vdgs.captures.optional_decoders import require_decoder
+from vdgs.captures.pillow_limits import pillow_without_limits
 from vdgs.errors import CaptureError
 from vdgs.system.permissions import refusal
 
@@ -80,7 +81,7 @@ def raw_tags(path: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]
         return {}, {}, {}, b""
     if preview.format != rawpy.ThumbFormat.JPEG:
         return {}, {}, {}, b""
-    with Image.open(io.BytesIO(preview.data)) as image:
+    with pillow_without_limits(), Image.open(io.BytesIO(preview.data)) as image:
         return _tags_of(image.getexif())
 
 

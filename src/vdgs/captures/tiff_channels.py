@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from PIL import Image, TiffImagePlugin
+from PIL import Image, TiffImagePlugin, UnidentifiedImageError
+
+from vdgs.captures.pillow_limits import pillow_without_limits
 
 _BITS, _PHOTOMETRIC, _SAMPLES, _LARGEST, _PLANAR, _EXTRA = 0x0102, 0x0106, 0x0115, 0x0119, 0x011C, 0x0152
 #: Channels of color by PhotometricInterpretation: gray, RGB, palette, CMYK, YCbCr, Lab.
@@ -97,11 +99,14 @@ def why_no_picture(path: Path) -> str:
 
 
 def _is_opened(path: Path) -> bool:
+    """Whether Pillow knows channels as a file has them; other faults of a file are told by who decodes it."""
     try:
-        with Image.open(path):
+        with pillow_without_limits(), Image.open(path):
             return True
-    except Exception:  # whatever Pillow finds wrong with it
+    except UnidentifiedImageError:
         return False
+    except Exception:  # of many kinds
+        return True
 
 
 def _count(tags: Mapping[int, Any]) -> int:

@@ -112,6 +112,7 @@ def sfm_command(arguments: list[str]) -> None:
     args = parse_arguments(SfmArguments, arguments, "sfm")
     from vdgs.captures.format_dispatch import lacks_points
     from vdgs.captures.output_guard import is_capture
+    from vdgs.sfm.image_list import HOW_TO_MAKE_NEW_POSES
     from vdgs.sfm.reconstruction_plan import print_plan
 
     request = SfmRequest(
@@ -120,7 +121,10 @@ def sfm_command(arguments: list[str]) -> None:
     )  # fmt: skip
     console = make_console(args.quiet and not args.dry_run)
     options = CaptureOptions(images=args.project_images)
-    is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
+    try:
+        is_posed = len(args.images) == 1 and lacks_points(args.images[0], options)
+    except CaptureError as error:
+        raise CaptureError(f"{error}\n{HOW_TO_MAKE_NEW_POSES}") from error
     if args.project_images is not None and not is_posed and not any(map(is_capture, args.images)):
         raise CaptureError(
             f"--images {args.project_images}: is for projects, whose photographs lie elsewhere. Of photographs alone "

@@ -398,11 +398,18 @@ def block_train_config(config: MethodConfig, num_views: int) -> TrainConfig:
         densify=replace(
             block.densify,
             stats_start=round(scale * block.densify.stats_start),
-            start=round(scale * block.densify.start),
+            start=scaled_growth_start(block.densify, scale),
         ),
         loss=replace(config.training.loss, random_background=block.random_background),
         compensation=block.compensation,
     )
+
+
+def scaled_growth_start(growth: DensifyConfig, scale: float) -> int:
+    """Where growth begins in a training of `scale` times as many steps. A start right behind a decision leaves that
+    decision out, and so does the scaled one (preset `paper`)."""
+    behind = growth.start % growth.every == 1
+    return round(scale * (growth.start - behind)) + behind
 
 
 def _steps(views: int, per_view: int, least: int, most: int) -> int:

@@ -110,11 +110,12 @@ def rasterization(
     which tells where the principal point is not its center: on Gaussians beside the image, and beyond 15 % of the
     image's side off its center, as in crops, also within it.
 
-    Raises ValueError for shapes that do not fit, TypeError for what is no tensor or array of float32, VdgsError for a
-    size or a degree that is no whole number, a plane, a radius or an eps2d that is no number, and a radius or an eps2d
-    below 0, RuntimeError on the way back with `create_graph=True`, UnsupportedOption for absgrad, sparse_grad,
-    distributed, fisheye and ftheta cameras, distortion, rolling shutter, `with_ut` and `with_eval3d`. Source: Kerbl et
-    al. 2023 (eqs. 2-6); Ye et al. 2025 for the interface.
+    Raises ValueError for shapes that do not fit, for viewmats and Ks with a number that is not finite (of one camera of
+    several too) or with their translation in the last row, TypeError for what is no tensor or array of float32,
+    VdgsError for a size or a degree that is no whole number, a plane, a radius or an eps2d that is no number, and a
+    radius or an eps2d below 0, RuntimeError on the way back with `create_graph=True`, UnsupportedOption for absgrad,
+    sparse_grad, distributed, fisheye and ftheta cameras, distortion, skew, rolling shutter, `with_ut` and
+    `with_eval3d`. Source: Kerbl et al. 2023 (eqs. 2-6); Ye et al. 2025 for the interface.
     """
     given = locals()
     _refuse_unsupported(given)

@@ -13,8 +13,9 @@ import numpy as np
 from PIL import Image, ImageOps
 from rich.console import Console
 
-from vdgs.captures.image_files import decode_image, pillow_without_limits
+from vdgs.captures.image_files import decode_image
 from vdgs.captures.jpeg import with_end
+from vdgs.captures.pillow_limits import pillow_without_limits
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import ExcludedImage

@@ -41,6 +41,10 @@ from vdgs.system.units import first_names
 
 #: Fewer photographs are no scene.
 MIN_IMAGES = 3
+#: What to do where poses are there that are not wanted, or cannot be read.
+HOW_TO_MAKE_NEW_POSES = (
+    "To make new poses of the photographs instead, give a folder of them without poses of other programs in it."
+)
 #: So many photographs of 16 bits are decoded before work begins: they come from one camera.
 _LOOKED_AT = 3
 
@@ -95,7 +99,8 @@ def collect_images(
             )
         if is_capture(folder):
             raise CaptureError(
-                f"{folder}: is a capture already. Use it as it is: vdgs run {shell_word(folder)} --output RUN"
+                f"{folder}: is a capture already. Use it as it is: vdgs run {shell_word(folder)} --output RUN\n"
+                f"{HOW_TO_MAKE_NEW_POSES}"
             )
         below = model_below(folder)
         if below:

@@ -17,9 +17,9 @@ from vdgs.captures.capture_root import capture_root
 from vdgs.captures.format_dispatch import READERS, read_source
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
 from vdgs.captures.georeference import Georef
-from vdgs.captures.image_files import pillow_without_limits
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.image_tags import kind_of, may_be_transparent
+from vdgs.captures.pillow_limits import pillow_without_limits
 from vdgs.captures.reconstruction import read_digests
 from vdgs.captures.split_lists import TEST_LIST, VALIDATION_LIST
 from vdgs.captures.splits import held_out_by_capture

@@ -98,17 +98,20 @@ def _load(file: Path) -> np.ndarray:
 
 
 def _image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
-    """The folder of the photographs: the one asked for, else images, else the largest images_N (which is said)."""
+    """The folder of the photographs: the one asked for, else images, else the largest images_N (which is said), else
+    the root."""
     if options.images is not None:
         return options.images, []
     named = [entry.name for entry in sorted(root.iterdir()) if entry.name.lower() == "images" and entry.is_dir()]
     if named:
         return ("images" if "images" in named else named[0]), []
     shrunk = largest_shrunk(root, "images")
+    if shrunk is None and _photographs(root):
+        return ".", [f"no images/ folder; the photographs in {root} are used (--images chooses)."]
     if shrunk is None:
         raise CaptureError(
-            f"{root}: {POSES_FILE} is there, and no folder images of its photographs (nor images_4, images_8, ...). "
-            "Name theirs: --images FOLDER"
+            f"{root}: {POSES_FILE} is there, and no folder images of its photographs (nor images_4, images_8, ...), "
+            "nor photographs beside it. Name their folder: --images FOLDER"
         )
     return shrunk, [f"no images/ folder; {shrunk} is used instead (--images chooses)."]
 
