@@ -14,8 +14,8 @@ from vdgs.errors import CaptureError
 GRAYS = ("L", "I;16", "I;16B", "I;16L")
 #: Of gray stored as color, channels differ by no more (levels), in the small picture that is looked at (pixels).
 _GRAY, _LOOKED_AT = 4, (128, 128)
-#: Of false color, levels scatter no more along its palette than so much of the whole. Measured: palettes as JPEG 0.04 to
-#: 0.20, photographs 0.32 to 1.
+#: Of false color, levels scatter no more along its palette than so much of the whole. Measured: palettes as JPEG 0.04
+#: to 0.20, photographs 0.32 to 1.
 _ON_CURVE = 0.25
 #: Less color, or less contrast, tells no palette (levels, standard deviation).
 _LEAST_SPREAD = 10.0
