@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,8 +62,13 @@ def test_a_folder_is_not_listed_for_each_photograph(tmp_path, monkeypatch):
     """At most once in each of the threads that begin together."""
     for k in range(12):
         Image.fromarray(np.roll(NOISE, 10 * k, 1)).save(tmp_path / f"{k}.jpg")
-    asked = []
-    monkeypatch.setattr(image_list, "list_folder", lambda folder: asked.append(folder) or list_folder(folder))
+    asked = list[Path]()
+
+    def listed(folder: Path) -> Mapping[str, Path]:
+        asked.append(folder)
+        return list_folder(folder)
+
+    monkeypatch.setattr(image_list, "list_folder", listed)
     assert len(image_list.collect_images([tmp_path]).images) == 12
     assert set(asked) == {tmp_path}
     assert len(asked) <= 4
