@@ -38,6 +38,16 @@ def shoot(
     return [folder / name for name in names]
 
 
+def heat(files: list[Path], palette: int | None = None) -> list[Path]:
+    """The files as a thermal camera shows them: in gray, or in the false color of one of OpenCV's palettes."""
+    for file in files:
+        with Image.open(file) as image:
+            exif, gray = image.getexif(), np.asarray(image.convert("L"))
+        shown = gray if palette is None else cv2.applyColorMap(gray, palette)[..., ::-1]
+        Image.fromarray(np.ascontiguousarray(shown)).save(file, exif=exif, quality=90)
+    return files
+
+
 def rename_model(file: Path, model: str) -> None:
     with Image.open(file) as image:
         exif, shown = image.getexif(), np.asarray(image)
@@ -98,13 +108,15 @@ def test_what_the_maker_calls_thermal_is_left_out_whatever_its_name_and_size(tmp
     ],
 )
 @pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("palette", [None, cv2.COLORMAP_INFERNO, cv2.COLORMAP_RAINBOW])
 def test_what_its_name_calls_thermal_is_left_out_where_it_has_the_size_of_its_sensor(
-    tmp_path, visible, thermal, together
+    tmp_path, visible, thermal, together, palette
 ):
-    """At any moment; and used where all are thermal."""
+    """At any moment, but for those that one letter behind a name tells; and used where all are thermal."""
     names = [thermal.format(k) for k in range(COUNT)]
     (tmp_path / names[0]).parent.mkdir(parents=True, exist_ok=True)
-    cold = shoot(tmp_path, names, 50, THERMAL, late_s=1800)
+    late_s = 1 if thermal.endswith(("_R.JPG", "_T.JPG")) else 1800
+    cold = heat(shoot(tmp_path, names, 50, THERMAL, late_s), palette)
     if not together:
         assert len(collect_images([tmp_path]).images) == COUNT
         return
@@ -117,7 +129,7 @@ def test_what_its_name_calls_thermal_is_left_out_where_it_has_the_size_of_its_se
 def test_what_its_folder_calls_thermal_is_left_out_beside_a_larger_photograph_of_its_moment(tmp_path, late_s):
     """A name alone is no sign."""
     visible = shoot(tmp_path / "rgb", [f"a{k}.JPG" for k in range(COUNT)])
-    thermal = shoot(tmp_path / "infrared", [f"b{k}.JPG" for k in range(COUNT)], 50, (300, 210), late_s)
+    thermal = heat(shoot(tmp_path / "infrared", [f"b{k}.JPG" for k in range(COUNT)], 50, (300, 210), late_s))
     if late_s > 2:
         assert len(collect_images([tmp_path]).images) == 2 * COUNT
     else:
@@ -137,7 +149,7 @@ def test_photographs_that_only_their_names_could_call_thermal_are_used(tmp_path,
 def test_djis_thermal_pictures_are_left_out_across_folders_and_without_a_partner(tmp_path, folders):
     stems = [f"DJI_2024032912000{k}_{k + 1:04d}" for k in range(COUNT)]
     visible = shoot(tmp_path / folders[0], [f"{stem}_W.JPG" for stem in stems[:-1]])
-    thermal = shoot(tmp_path / folders[1], [f"{stem}_T.JPG" for stem in stems], 50, (300, 210))
+    thermal = heat(shoot(tmp_path / folders[1], [f"{stem}_T.JPG" for stem in stems], 50, (300, 210)))
     only_thermal_are_left_out(tmp_path, visible, thermal, "thermal picture")
     assert f"of the size of {folders[1]}{stems[0]}_T" in collect_images([tmp_path]).excluded[-1].reason
 
@@ -148,8 +160,46 @@ def test_pictures_of_the_size_of_a_thermal_sensor_need_a_longer_lens_and_a_photo
 ):
     """As DJI's Mavic 2 Enterprise counts both in one row."""
     visible = shoot(tmp_path, [f"DJI_{2 * k:04d}.JPG" for k in range(COUNT)])
-    thermal = shoot(tmp_path, [f"DJI_{2 * k + 1:04d}.JPG" for k in range(COUNT)], 50, THERMAL, late_s, focal_mm)
+    thermal = heat(shoot(tmp_path, [f"DJI_{2 * k + 1:04d}.JPG" for k in range(COUNT)], 50, THERMAL, late_s, focal_mm))
     if (focal_mm, late_s) == (20.0, 1):
         only_thermal_are_left_out(tmp_path, visible, thermal, "by its size (320 x 256), its longer lens and its moment")
     else:
         assert len(collect_images([tmp_path]).images) == 2 * COUNT
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("IR/IMG_{:04d}.JPG", THERMAL), ("site_IR/IMG_{:04d}.JPG", (300, 210)), ("p{:04d}_R.JPG", THERMAL),
+        ("p{:04d}_T.JPG", THERMAL), ("facade_T_{:02d}.JPG", THERMAL), ("DJI_{:04d}_T.JPG", (300, 210)),
+    ],
+)  # fmt: skip
+def test_photographs_in_color_are_used_whatever_their_names(tmp_path, name, size):
+    """Also beside larger ones of their number and moment."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    shoot(tmp_path, [f"p{k:04d}.JPG" for k in range(COUNT)])
+    shoot(tmp_path, [f"DJI_{k:04d}_W.JPG" for k in range(COUNT)], 20)
+    shoot(tmp_path, [name.format(k) for k in range(COUNT)], 50, size)
+    assert len(collect_images([tmp_path]).images) == 3 * COUNT
+
+
+@pytest.mark.parametrize("name", ["cam_R_{:04d}.JPG", "facade_T_{:04d}.JPG"])
+def test_a_letter_tells_a_thermal_camera_only_beside_another_and_not_where_left_ones_are(tmp_path, name):
+    """Gray ones, too: cameras of a rig."""
+    shoot(tmp_path, [f"cam_F_{k:04d}.JPG" for k in range(COUNT)])
+    heat(shoot(tmp_path, [f"cam_L_{k:04d}.JPG" for k in range(COUNT)], 20, THERMAL))
+    heat(shoot(tmp_path, [name.format(k) for k in range(COUNT)], 50, THERMAL))
+    assert len(collect_images([tmp_path]).images) == 3 * COUNT
+
+
+def test_a_larger_photograph_of_the_moment_counts_where_it_is_of_the_maker_or_the_place(tmp_path):
+    visible = shoot(tmp_path, [f"a{k}.JPG" for k in range(COUNT)])
+    thermal = heat(shoot(tmp_path, [f"a{k}_IR.JPG" for k in range(COUNT)], 50, (300, 210)))
+    for file in (*visible, *thermal):
+        with Image.open(file) as image:
+            exif, shown = image.getexif(), np.asarray(image)
+        exif[0x010F] = "Other" if file in thermal else "Maker"
+        if file in thermal:
+            exif.get_ifd(0x8825)[2] = (1.0, 0.0, 0.0)
+        Image.fromarray(shown).save(file, exif=exif, quality=95)
+    assert len(collect_images([tmp_path]).images) == 2 * COUNT

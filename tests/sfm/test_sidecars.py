@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from vdgs.sfm import image_list
 from vdgs.sfm.image_metadata import read_image_metadata
-from vdgs.sfm.sidecars import with_sidecars
+from vdgs.sfm.sidecars import list_folder, with_sidecars
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 
@@ -41,3 +44,31 @@ def test_positions_of_files_beside_stripped_photographs_are_used(tmp_path, photo
     assert beside in found.doubts[0]
     (tmp_path / beside).write_text("[[" if beside.endswith("json") else "<")
     assert with_sidecars(read_image_metadata(tmp_path / photo, photo)).lat_lon is None
+
+
+def test_the_json_of_another_file_that_is_there_is_not_taken(tmp_path):
+    Image.fromarray(NOISE).save(tmp_path / "x.jpg")
+    for name, latitude in (("x.PNG.json", 10.0), ("x.tif.json", 20.0), ("x.HEIC.json", 30.0)):
+        (tmp_path / name).write_text(json.dumps({"geoData": {"latitude": latitude, "longitude": 5.0}}))
+    (tmp_path / "x.PNG").touch()
+    photo = read_image_metadata(tmp_path / "x.jpg", "x.jpg")
+    assert with_sidecars(photo).lat_lon == (30.0, 5.0)  # what phones take is the likeliest
+    for gone, place in (("x.HEIC.json", (20.0, 5.0)), ("x.tif.json", None)):
+        (tmp_path / gone).unlink()
+        assert with_sidecars(photo).lat_lon == place
+
+
+def test_a_folder_is_not_listed_for_each_photograph(tmp_path, monkeypatch):
+    """At most once in each of the threads that begin together."""
+    for k in range(12):
+        Image.fromarray(np.roll(NOISE, 10 * k, 1)).save(tmp_path / f"{k}.jpg")
+    asked = list[Path]()
+
+    def listed(folder: Path) -> Mapping[str, Path]:
+        asked.append(folder)
+        return list_folder(folder)
+
+    monkeypatch.setattr(image_list, "list_folder", listed)
+    assert len(image_list.collect_images([tmp_path]).images) == 12
+    assert set(asked) == {tmp_path}
+    assert len(asked) <= 4

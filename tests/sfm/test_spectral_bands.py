@@ -101,8 +101,7 @@ def test_the_sixth_band_is_known_by_its_size(tmp_path, size, band, used):
 
 @pytest.mark.parametrize("tags", [True, False])
 def test_color_and_a_band_are_not_used_together(tmp_path, tags):
-    """Of a color camera whose lens is unknown the photographs are used; pictures without any tags are none of a camera
-    beside bands that say theirs."""
+    """The photographs in color are used, whether or not tags say their camera, unless those of the band are more."""
     colors = [f"IMG_{k:04d}_RGB.JPG" for k in range(COUNT)]
     for k, name in enumerate(colors):
         exif = Image.Exif()
@@ -110,6 +109,8 @@ def test_color_and_a_band_are_not_used_together(tmp_path, tags):
             exif[0x010F], exif[0x0110] = "Parrot", "Sequoia"
         Image.fromarray(noise(k)).save(tmp_path / name, exif=exif, quality=95)
     bands(tmp_path, [f"IMG_{k:04d}_{band}.TIF" for k in range(COUNT) for band in ("GRE", "NIR")])
+    assert [photo.name for photo in collect_images([tmp_path]).images] == colors
+    (tmp_path / colors.pop()).unlink()
     found = collect_images([tmp_path])
     assert [photo.name for photo in found.images] == (
         colors if tags else [f"IMG_{k:04d}_GRE.TIF" for k in range(COUNT)]
@@ -117,6 +118,21 @@ def test_color_and_a_band_are_not_used_together(tmp_path, tags):
     if not tags:
         reasons = {each.name: each.reason for each in found.excluded}
         assert "none of the band Green" in reasons[colors[0]]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [["IMG_0001_2.jpg"], ["shed_red.jpg"], ["IMG_0001_2.jpg", "IMG_0002_2.jpg"], ["IMG_0001_1.jpg", "a_NIR.jpg"]],
+)
+def test_a_few_gray_pictures_with_the_name_of_a_band_are_no_set(tmp_path, names):
+    """Beside photographs without tags."""
+    for k in range(COUNT):
+        Image.fromarray(noise(k)).save(tmp_path / f"frame{k}.jpg", quality=95)
+    for k, name in enumerate(names):
+        Image.fromarray(noise(20 + k)[..., 0]).save(tmp_path / name, quality=95)
+    found = collect_images([tmp_path])
+    assert len(found.images) == COUNT + len(names)
+    assert not any("single bands" in note for note in found.notes)
 
 
 def test_of_a_tiff_of_five_channels_it_is_said_what_it_is(tmp_path):

@@ -184,8 +184,8 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     """Pictures among the photographs that are none of the flight, with the reason; and photographs whose tags were
     lost, with the camera of the others of their size.
 
-    A picture without any tags is a stray only where most others have them, and has lost its tags where half do; where
-    fewer do, it is said what it may be.
+    A picture without any tags is a stray only where most others have them and no file beside it says its place, and has
+    lost its tags where half do; where fewer do, it is said what it may be.
     """
     reasons = other_cameras(photographs)
     reasons |= versions([photo for photo in photographs if photo.name not in reasons])
@@ -198,7 +198,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
         if len(bare) > len(tagged):
             if len(alike) == 1 and alike[0][1] is not None:
                 lent[photo.name] = replace(photo, doubts=(*photo.doubts, _may_be_by(alike[0][0])))
-        elif not alike and len(bare) < len(tagged):
+        elif not alike and len(bare) < len(tagged) and photo.lat_lon is None:
             reasons[photo.name] = (
                 f"has no tags of a camera, and {photo.width} x {photo.height} pixels, unlike the photographs: no "
                 "photograph of this flight? (Give it their tags if it is one.)"

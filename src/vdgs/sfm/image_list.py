@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
@@ -33,7 +34,7 @@ from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wi
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.photograph_versions import taken_apart
 from vdgs.sfm.rig_folders import with_sensors
-from vdgs.sfm.sidecars import with_sidecars
+from vdgs.sfm.sidecars import list_folder, with_sidecars
 from vdgs.sfm.used_bands import unused_bands
 from vdgs.system.content_digests import find_copies
 from vdgs.system.quoting import shell_word
@@ -114,7 +115,7 @@ def collect_images(
     masks, notes = find_masks(folders, found.named.values())
     named = {name: path for name, path in found.named.items() if path in masks}
     with ThreadPoolExecutor(4) as pool:
-        read = list(pool.map(_read, named.values(), named.keys(), masks.values()))
+        read = list(pool.map(partial(_read, cache(list_folder)), named.values(), named.keys(), masks.values()))
     photographs = [each for each in read if isinstance(each, ImageMetadata)]
     left_out = [ExcludedImage(name, why) for name, why in found.left_out.items()]
     left_out += [each for each in read if isinstance(each, ExcludedImage)]
@@ -225,9 +226,11 @@ def _of_the_flight(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMeta
     return cross_checked(kept), [ExcludedImage(name, why) for name, why in sorted(reasons.items())]
 
 
-def _read(path: Path, name: str, mask: Path | None) -> ImageMetadata | ExcludedImage:
+def _read(
+    listed: Callable[[Path], Mapping[str, Path]], path: Path, name: str, mask: Path | None
+) -> ImageMetadata | ExcludedImage:
     try:
-        photo = with_sidecars(replace(read_image_metadata(path, name), mask=mask))
+        photo = with_sidecars(replace(read_image_metadata(path, name), mask=mask), listed)
     except UnusableImage as why:
         return ExcludedImage(name, str(why))
     check_mask(photo)

@@ -30,7 +30,7 @@ from vdgs.sfm.exif_gps import (
 )
 from vdgs.sfm.focal_length import Lens, read_lens
 from vdgs.sfm.map_datums import to_wgs84
-from vdgs.sfm.spectral_bands import band_of
+from vdgs.sfm.spectral_bands import band_of, is_surely_of_band
 from vdgs.sfm.thermal_signs import thermal_sign
 from vdgs.sfm.xmp import first_number, read_xmp, text
 from vdgs.system.permissions import refusal
@@ -212,6 +212,8 @@ class ImageMetadata:
     """What makes it other than 8-bit sRGB in a file that all programs read, such as HEIC; empty for what is."""
     band: str = ""
     """The one band of a multispectral camera that it shows; empty for color."""
+    band_is_sure: bool = True
+    """False where a name that others use, too, alone says that."""
     camera_model: str = RADIAL
     """COLMAP's, by which the lens is fitted."""
     is_panorama: bool = False
@@ -348,6 +350,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         whole=found.whole,
         kind=found.kind,
         band=band_of(path, found.mode, xmp),
+        band_is_sure=is_surely_of_band(path, xmp),
         camera_model=FISHEYE if _is_fisheye(details, xmp) else RADIAL,
         is_panorama=panorama,
         exposure_bias=finite(details.get(0x9204)),

@@ -9,8 +9,12 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import PurePosixPath
 
+import numpy as np
+
+from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.sfm.flights import time_of
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
+from vdgs.sfm.picture_colors import looks_thermal
 
 #: How DJI names what cameras of one drone take at a moment: DJI_20240329124328_0001_T, maybe with a flight behind it.
 _DJI_NAME = re.compile(
@@ -23,6 +27,8 @@ _THERMAL_WORD = re.compile(
 )
 #: What makers put behind the names of them (DJI's XT2: DJI_0001_R beside DJI_0001).
 _THERMAL_TAIL = re.compile(r".*_[RT](?:_.*)?", re.IGNORECASE)
+#: A name with the letter of a camera.
+_LETTERED = re.compile(r"(?P<number>.*)_(?P<letter>[A-Z])(?P<after>_.*)?", re.IGNORECASE)
 #: Folders of memory cards, below which a person's own are.
 _CARD_FOLDER = re.compile(r"DCIM|\d{3}[A-Z_]\w*", re.IGNORECASE)
 #: Sizes of thermal sensors, and those that makers enlarge them to (pixels).
@@ -37,6 +43,10 @@ _SAME_MOMENT = timedelta(seconds=2)
 _LONGER = 1.2
 #: Of pictures that nothing names thermal, so many have a photograph of their moment beside them (choice).
 _SHARE_BESIDE = 0.9
+#: So far apart (metres; choice) are cameras of one moment on one drone at most.
+_SAME_PLACE_M = 30.0
+#: So many pictures of a camera, folder and size are looked at, of which half must look thermal (choice).
+_LOOKED_AT = 5
 #: Where fewer photographs would be left, thermal pictures are what is wanted.
 LEAST_VISIBLE = 3
 _REMEDY = "give a folder of those alone to use them"
@@ -46,15 +56,17 @@ def other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """Pictures of a thermal camera and of the screen among photographs, with the reason.
 
     Thermal is what its maker's tags call so, and by its name what also has the size of a thermal sensor, smaller than
-    the photographs, or a larger one of its moment beside it. None are left out where few others would be left.
+    the photographs, or a larger one of its moment beside it, and looks so. None are left out where few others would be
+    left.
     """
     thermal, screen = _beside(photographs)
-    thermal |= {
-        photo.name: f"is a thermal picture ({photo.thermal}): {_REMEDY}" for photo in photographs if photo.thermal
-    }
+    said = {photo.name: f"is a thermal picture ({photo.thermal}): {_REMEDY}" for photo in photographs if photo.thermal}
+    thermal |= said
     thermal |= _by_name([photo for photo in photographs if photo.name not in thermal | screen])
     thermal |= _unnamed([photo for photo in photographs if photo.name not in thermal | screen])
     thermal |= _like_others(photographs, thermal)
+    colored = _in_color([photo for photo in photographs if photo.name in thermal and photo.name not in said])
+    thermal = {name: why for name, why in thermal.items() if name not in colored}
     visible = [photo for photo in photographs if photo.name not in thermal | screen and not photo.is_bare]
     return screen | thermal if len(visible) >= LEAST_VISIBLE else screen
 
@@ -123,16 +135,17 @@ def _has_thermal_word(photo: ImageMetadata) -> bool:
 def _by_name(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """Pictures with the name of a thermal one and its size, or with a larger photograph of their moment."""
     named = [photo for photo in photographs if _has_thermal_word(photo)]
-    tailed = [photo for photo in photographs if _THERMAL_TAIL.fullmatch(PurePosixPath(photo.name).stem)]
+    tailed = _tailed(photographs)
     names = {photo.name for photo in (*named, *tailed)}
     others = [photo for photo in photographs if photo.name not in names]
     if not others:
         return {}
-    usual = Counter(photo.size for photo in others).most_common(1)[0][0]
+    counts = Counter(photo.width * photo.height for photo in others)
+    usual = min(counts, key=lambda area: (-counts[area], area))
     found = {
         photo.name: f"is a thermal picture by its name and size ({photo.width} x {photo.height}): {_REMEDY}"
         for photo in (*named, *tailed)
-        if _has_thermal_size(photo) and photo.width * photo.height < usual[0] * usual[1]
+        if _has_thermal_size(photo) and photo.width * photo.height < usual
     }
     moments = _Moments(others)
     for photo in named:
@@ -140,6 +153,33 @@ def _by_name(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
         if photo.name not in found and beside is not None:
             found[photo.name] = f"is a thermal picture by its name, and {beside.name} is of its moment: {_REMEDY}"
     return found
+
+
+def _tailed(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
+    """Pictures with a thermal camera's letter and a partner: of their number and moment, without a letter or with
+    another. Right ones of a pair have a left one of their size."""
+    shots: dict[str, list[tuple[str, ImageMetadata]]] = {}
+    lettered = list[tuple[str, str, ImageMetadata]]()
+    for photo in photographs:
+        stem = PurePosixPath(photo.name).stem.upper()
+        shots.setdefault(stem, []).append(("", photo))
+        if match := _LETTERED.fullmatch(stem):
+            number = f"{match['number']}{match['after'] or ''}"
+            lettered.append((number, match["letter"], photo))
+            shots.setdefault(number, []).append((match["letter"], photo))
+    found = []
+    for number, letter, photo in lettered:
+        others = [(name, other) for name, other in shots[number] if name != letter]
+        is_right = any(name == "L" and other.size == photo.size for name, other in others)
+        if letter in "RT" and not is_right and any(_may_be_beside(photo, other) for _, other in others):
+            found.append(photo)
+    return found
+
+
+def _may_be_beside(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether another is larger, and of the moment as far as both are known."""
+    moments = time_of(photo.datetime), time_of(other.datetime)
+    return _is_larger(other, photo) and (None in moments or _near(*moments))
 
 
 def _unnamed(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
@@ -181,12 +221,23 @@ class _Moments:
         self._times = [taken for taken, _ in self._taken]
 
     def larger_than(self, photo: ImageMetadata) -> ImageMetadata | None:
-        """The first larger photograph of the moment of another; None where there is none."""
+        """The first larger photograph of the moment of another, of its maker or place; None where there is none."""
         taken = time_of(photo.datetime)
         if taken is None:
             return None
         first, last = bisect_left(self._times, taken - _SAME_MOMENT), bisect_right(self._times, taken + _SAME_MOMENT)
-        return next((other for _, other in self._taken[first:last] if _is_larger(other, photo)), None)
+        near = (other for _, other in self._taken[first:last])
+        return next((other for other in near if _is_larger(other, photo) and _are_together(photo, other)), None)
+
+
+def _are_together(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether both are of one maker, or were taken at one place."""
+    if photo.camera.split()[0] == other.camera.split()[0] and not photo.camera.startswith(UNKNOWN_CAMERA):
+        return True
+    if photo.lat_lon is None or other.lat_lon is None:
+        return False
+    away = enu_from_geodetic(np.array([[*photo.lat_lon, 0.0]]), (*other.lat_lon, 0.0))[0]
+    return bool(np.linalg.norm(away) <= _SAME_PLACE_M)
 
 
 def _like_others(photographs: Sequence[ImageMetadata], thermal: dict[str, str]) -> dict[str, str]:
@@ -201,3 +252,16 @@ def _like_others(photographs: Sequence[ImageMetadata], thermal: dict[str, str]) 
 
 def _is_named(photo: ImageMetadata) -> bool:
     return _has_thermal_word(photo) or _THERMAL_TAIL.fullmatch(PurePosixPath(photo.name).stem) is not None
+
+
+def _in_color(photographs: Sequence[ImageMetadata]) -> set[str]:
+    """The names of those that no thermal camera took, by the pixels of some of each camera, folder and size."""
+    groups: dict[tuple[str, PurePosixPath, tuple[int, int]], list[ImageMetadata]] = {}
+    for photo in photographs:
+        groups.setdefault((photo.camera, PurePosixPath(photo.name).parent, photo.size), []).append(photo)
+    found = set[str]()
+    for taken in groups.values():
+        looked_at = taken[:: -(-len(taken) // _LOOKED_AT)]
+        if 2 * sum(looks_thermal(photo.path) for photo in looked_at) < len(looked_at):
+            found |= {photo.name for photo in taken}
+    return found

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import unicodedata
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -20,17 +22,25 @@ from vdgs.sfm.xmp import read_xmp
 #: Google Takeout cuts names at so many letters, before the number of a double and `.json`.
 _TAKEOUT_LETTERS = 46
 _DOUBLE = re.compile(rf"(.*?)(?:-(?:{EDITED_WORDS}))?(\(\d+\))?", re.IGNORECASE)
-#: What Google Photos keeps under a name of which a photograph may have been converted.
-_CONVERTED = HEIF_SUFFIXES | AVIF_SUFFIXES | IMAGE_SUFFIXES | {".dng"}
+#: What Google Photos keeps under a name of which a photograph may have been converted, the likeliest first.
+_CONVERTED = (*sorted(HEIF_SUFFIXES), *sorted(AVIF_SUFFIXES), ".dng", *sorted(IMAGE_SUFFIXES))
 #: Larger files are none (bytes).
 _LARGEST = 1 << 20
 
 
-def with_sidecars(photo: ImageMetadata) -> ImageMetadata:
-    """A photograph without a position with the one of Google Takeout's JSON, or of an XMP file, beside it."""
+def list_folder(folder: Path) -> Mapping[str, Path]:
+    """The files of a folder by their names, composed as Unicode's NFC."""
+    with suppress(OSError):
+        return {unicodedata.normalize("NFC", name): folder / name for name in os.listdir(folder)}
+    return {}
+
+
+def with_sidecars(photo: ImageMetadata, listed: Callable[[Path], Mapping[str, Path]] = list_folder) -> ImageMetadata:
+    """A photograph without a position with the one of Google Takeout's JSON, or of an XMP file, beside it; `listed` is
+    `list_folder`, which may be cached."""
     if photo.lat_lon is not None:
         return photo
-    for file in _takeout_names(photo.path):
+    for file in _takeout_files(photo.path, listed(photo.path.parent)):
         content = _read_json(file)
         geo = [content.get(key) for key in ("geoDataExif", "geoData")]  # the camera's before what people set
         for place in (each for each in geo if isinstance(each, dict)):
@@ -61,22 +71,22 @@ def _beside(file: Path) -> str:
     return f"says no position; that of the {file.suffix} beside it is used ({file.name})"
 
 
-def _takeout_names(path: Path) -> list[Path]:
-    """What Takeout calls the JSON of a photograph, today and until 2024."""
-    own = _json_names(path, path.suffix)
-    if any(file.is_file() for file in own):
+def _takeout_files(path: Path, beside: Mapping[str, Path]) -> list[Path]:
+    """Takeout's JSON of a photograph, as it is called today and was until 2024; of another ending, that of what the
+    photograph was converted from, unless that is there, too."""
+    stem = unicodedata.normalize("NFC", path.stem)
+    if own := [beside[name] for name in _json_names(stem, path.suffix) if name in beside]:
         return own
-    # Of another ending: of a photograph that was converted.
-    endings = [each for suffix in sorted(_CONVERTED) for each in (suffix, suffix.upper())]
-    return [file for ending in endings for file in _json_names(path, ending)]
+    endings = [each for suffix in _CONVERTED for each in (suffix, suffix.upper()) if f"{stem}{each}" not in beside]
+    return [beside[name] for ending in endings for name in _json_names(stem, ending) if name in beside]
 
 
-def _json_names(path: Path, suffix: str) -> list[Path]:
-    match = _DOUBLE.fullmatch(unicodedata.normalize("NFC", path.stem))
-    stem, double = (match[1], match[2] or "") if match else (path.stem, "")
-    name = f"{stem}{suffix}"
+def _json_names(stem: str, suffix: str) -> list[str]:
+    match = _DOUBLE.fullmatch(stem)
+    first, double = (match[1], match[2] or "") if match else (stem, "")
+    name = f"{first}{suffix}"
     whole = (f"{name}.supplemental-metadata", name)
-    return [path.with_name(f"{each[:_TAKEOUT_LETTERS]}{double}.json") for each in whole]
+    return [f"{each[:_TAKEOUT_LETTERS]}{double}.json" for each in whole]
 
 
 def _read_json(file: Path) -> dict[str, Any]:

@@ -13,8 +13,10 @@ from vdgs.sfm.spectral_bands import BY_NUMBER, MICASENSE
 #: The band that shows the ground as eyes do, where there is no color: the first of these that is there.
 _PREFERRED = ("panchro", "green", "red", "blue")
 _THERMAL = re.compile("lwir|thermal", re.IGNORECASE)
-#: Fewer color photographs than this share of the exposures are none of the set.
+#: Fewer color photographs with tags than this share of the exposures are none of the set.
 _COLOR_SHARE = 0.5
+#: Fewer pictures with the name of a band are none, unless more than the name says so (choice).
+_LEAST_NAMED = 3
 
 
 def unused_bands(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], list[str]]:
@@ -24,11 +26,12 @@ def unused_bands(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], 
     if not counts:
         return {}, []
     bands = ", ".join(f"{band} ({number})" for band, number in sorted(counts.items()))
-    color = sum(not photo.band and not photo.is_bare for photo in photographs)
-    if color >= _COLOR_SHARE * max(counts.values()):
-        used, how = "", f"the {color} color photographs beside them are used"
+    used = min(counts, key=lambda band: (_rank(band), -counts[band], band))
+    color = [photo for photo in photographs if photo.name not in band_of]
+    tagged = sum(not photo.is_bare for photo in color)
+    if tagged >= _COLOR_SHARE * max(counts.values()) or len(color) >= counts[used]:
+        used, how = "", f"the {len(color)} color photographs beside them are used"
     else:
-        used = min(counts, key=lambda band: (_rank(band), -counts[band], band))
         how = f"{used} is used, in gray, without calibration of reflectance"
     left = {
         name: f"is of the band {band}; a folder of one band alone can be used"
@@ -38,8 +41,7 @@ def unused_bands(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], 
     if used:  # in one scene, gray and color would make a mixture of both
         left |= {
             photo.name: f"is none of the band {used}, which is used; a folder of color photographs alone can be used"
-            for photo in photographs
-            if not photo.band
+            for photo in color
         }
     return left, [f"pictures of single bands: {bands}; {how}."]
 
@@ -54,10 +56,19 @@ def _by_size(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """The band of each picture that is of one, by its name. A band known by its number alone is panchromatic where its
     pictures are larger than those of the others, and thermal where they are smaller (MicaSense's Altum, Altum-PT and
     RedEdge-P)."""
-    bands = {photo.name: photo.band for photo in photographs if photo.band}
+    photographs = _of_bands(photographs)
+    bands = {photo.name: photo.band for photo in photographs}
     usual = Counter(photo.size for photo in photographs if photo.band in MICASENSE).most_common(1)
     for photo in photographs if usual else ():
         if photo.band.startswith(BY_NUMBER) and photo.size != usual[0][0]:
             larger = photo.width * photo.height > math.prod(usual[0][0])
             bands[photo.name] = "Panchro" if larger else "LWIR"
     return bands
+
+
+def _of_bands(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
+    """The pictures of bands: what its name alone says to be of one is so in a set of several bands."""
+    counts = Counter(photo.band for photo in photographs if photo.band)
+    sure = {photo.band for photo in photographs if photo.band and photo.band_is_sure}
+    known = {band for band in counts if band in sure or counts[band] >= _LEAST_NAMED}
+    return [photo for photo in photographs if photo.band in known and (photo.band_is_sure or len(known) > 1)]
