@@ -389,10 +389,8 @@ class _SlurmAttempt:
         if record is None and job.state in ("", "FAILED"):
             output = self.folder / f"{self.task_id.index}.out"
             said = tail_lines(output)
-            hint = (
-                f"{said[-1]} ({output})" if said else f"see that it sees {self.folder} (it printed nothing: {output})"
-            )
-            return AttemptResult(None, f"an error on its node{where} before its first line: {hint}")
+            what = f"{said[-1]} ({output})" if said else f"see that it sees {self.folder} (nothing is in {output})"
+            return AttemptResult(None, f"an error on its node{where} before its first line: {what}")
         how = END_REASONS.get(job.state, f"SLURM ({job.state})" if job.state else "SLURM, without a word")
         return AttemptResult(None, f"{how}{where}", job.state == "OUT_OF_MEMORY")
 
