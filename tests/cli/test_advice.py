@@ -30,7 +30,7 @@ OF_OTHERS = {
         "--format",
         "--parsable",
     },
-    "slurm_executor.py": {"--requeue", "--exclude"},
+    "slurm_executor.py": {"--requeue", "--exclude", "--name"},
     "crs.py": {"--file"},
     "launch.py": {"--std"},
     "nvrtc.py": {"--gpu-architecture"},

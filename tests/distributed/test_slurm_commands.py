@@ -51,13 +51,14 @@ def test_the_number_of_a_job_is_found_among_other_lines(monkeypatch, answer):
     assert slurm_commands.submit(Path("job.sh")) == "4000"
 
 
-@pytest.mark.parametrize("answer", ["", GREETING, "Submitted\n"])
+@pytest.mark.parametrize("answer", ["", GREETING, "Misuse is not permitted\n"])
 def test_an_answer_without_a_number_is_quoted(monkeypatch, answer):
     answers(monkeypatch, sbatch=answer)
     with pytest.raises(UnreadableAnswerError) as raised:
         slurm_commands.submit(Path("job.sh"))
     assert repr(answer.strip()) in str(raised.value)
     assert raised.value.is_uncertain
+    assert not raised.value.is_final
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,14 @@ def test_what_was_taken_and_is_not_found_is_not_submitted_again(tmp_path, monkey
     assert len(slurm.scripts) == 1
 
 
+def test_a_driver_that_stops_names_what_slurm_may_have_taken(tmp_path, monkeypatch):
+    said = list[str]()
+    slurm = Controller(monkeypatch, [UNREADABLE], {3: lambda: signal.raise_signal(signal.SIGTERM)})
+    (result,) = run(tmp_path, 1, said)
+    assert result.state == "stopped"
+    assert f"`scancel --name={slurm.scripts[0].parent.name}` ends them" in said[-1]
+
+
 @pytest.mark.parametrize(
     ("state", "reason", "said_of"),
     [

@@ -103,6 +103,11 @@ class SlurmError(VdgsError):
 class UnreadableAnswerError(SlurmError):
     """SLURM took a job, and its number is not known."""
 
+    @property
+    def is_final(self) -> bool:
+        """Whatever the words that it quotes say."""
+        return False
+
 
 def require_slurm() -> None:
     """Raise VdgsError where SLURM's commands are not there."""

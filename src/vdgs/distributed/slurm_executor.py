@@ -89,6 +89,8 @@ class _Submission:
     folder: Path
     attempts: list[_SlurmAttempt]
     failures: int = 0
+    is_uncertain: bool = False
+    """It may have been taken."""
     unread: UnreadableAnswerError | None = None
     """It was taken: it is not submitted again, but looked for in the queue."""
 
@@ -159,6 +161,12 @@ class _SlurmEngine:
             self._notices.add(key)
             self._listener.on_notice(text)
 
+    def report_unknown(self, folder: Path) -> None:
+        """Say that jobs without a number may be in the queue all the same, where that is so."""
+        if any(each.folder == folder and each.is_uncertain for each in self._unanswered):
+            text = f"SLURM may have taken jobs of unknown number: `scancel --name={folder.name}` ends them."
+            self.notify((folder.name,), text)
+
     def _report_stuck(self) -> None:
         """Say which jobs wait for what time does not bring, and what does."""
         stuck = defaultdict[tuple[str, str], list[QueueEntry]](list)
@@ -219,6 +227,7 @@ class _SlurmEngine:
     def _not_taken(self, submission: _Submission, error: SlurmError) -> None:
         """Ask again later where that may help; fail at once what SLURM refuses for good: with the nodes that it was to
         avoid, or with more than it has."""
+        submission.is_uncertain |= error.is_uncertain
         if isinstance(error, UnreadableAnswerError):
             submission.unread = error
         most = MAX_MISSED_POLLS if submission.unread else MAX_FAILED_POLLS
@@ -325,6 +334,7 @@ class _SlurmAttempt:
 
     def request_stop(self) -> None:
         if not self.task_id.array:
+            self._engine.report_unknown(self.folder)
             self._result = AttemptResult(EXIT_STOPPED)
         elif self.start_info is None:
             self._is_cancelled = True
