@@ -12,6 +12,7 @@ import vdgs
 from experiments.bench.cli import BenchArguments
 from vdgs.cli.advice import COMMAND, OPTION, Advice, flags_of
 from vdgs.cli.main import COMMANDS, verb_arguments
+from vdgs.system.exit_codes import exit_code_of
 
 SOURCE = Path(vdgs.__file__).parent
 #: Options of other programs, by the end of the file that names them.
@@ -29,7 +30,7 @@ OF_OTHERS = {
         "--format",
         "--parsable",
     },
-    "slurm_executor.py": {"--requeue", "--exclude"},
+    "slurm_executor.py": {"--requeue", "--exclude", "--name"},
     "crs.py": {"--file"},
     "launch.py": {"--std"},
     "nvrtc.py": {"--gpu-architecture"},
@@ -132,3 +133,16 @@ def test_advice_is_fitted_to_the_verb():
     assert Advice("merge", all_arguments).fit("Add --undistort.") == "Add --undistort. (--undistort of `vdgs run`)"
     named = "Cut the scene again: vdgs partition RUN --blocks 2"
     assert Advice("merge", all_arguments).fit(named) == named
+
+
+def test_advice_that_fails_hides_no_error(capsys):
+    """Where memory is short, making advice needs some too."""
+
+    def action() -> None:
+        raise MemoryError
+
+    def fit(text: str) -> str:
+        raise MemoryError
+
+    assert exit_code_of("vdgs run", action, "", fit) == 1
+    assert capsys.readouterr().err.startswith("vdgs run: out of memory (no room). What was saved is kept. Smaller")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+import signal
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from vdgs.distributed import slurm_commands, slurm_executor
 from vdgs.distributed.executor import EXIT_STOPPED, AttemptResult, LogListener, Task, TaskResources, TaskResult
 from vdgs.distributed.node_check import NodeRequirements
 from vdgs.distributed.scheduler import MAX_NODE_REJECTIONS
-from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError
+from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError, UnreadableAnswerError
 from vdgs.distributed.slurm_executor import SlurmExecutor, make_batch_script
 from vdgs.distributed.slurm_job import SlurmTaskRecord
 from vdgs.errors import VdgsError
@@ -27,8 +28,13 @@ class Controller:
     """SLURM's commands, of which `answers` to sbatch come one by one: words that refuse, or None; and what happens at
     which poll, where jobs end as `ends` says."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, answers: list[str | None], at: dict[int, Callable[[], object]]):
-        self.answers, self.at, self.polls = answers, at, 0
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        answers: Sequence[str | SlurmError | None],
+        at: dict[int, Callable[[], object]],
+    ):
+        self.answers, self.at, self.polls = list(answers), at, 0
         self.scripts, self.signals = list[Path](), list[tuple[str, str]]()
         self.queue = dict[ArrayTaskId, QueueEntry]()
         self.states = dict[str, str]()
@@ -38,7 +44,7 @@ class Controller:
     def submit(self, script: Path) -> str:
         self.scripts.append(script)
         if self.answers and (refusal := self.answers.pop(0)) is not None:
-            raise SlurmError(f"sbatch: error: {refusal}")
+            raise refusal if isinstance(refusal, SlurmError) else SlurmError(f"sbatch: error: {refusal}")
         return self.take(script)
 
     def take(self, script: Path) -> str:
@@ -106,6 +112,88 @@ def test_a_busy_controller_is_asked_again_and_the_other_blocks_go_on(tmp_path, m
     assert [(each.state, each.attempts) for each in done] == [("done", 2), ("done", 1)]
     assert len(slurm.scripts) == last
     assert not slurm.signals
+
+
+UNREADABLE = UnreadableAnswerError("sbatch took it, but its answer has no line with the number: 'Welcome'")
+
+
+@pytest.mark.parametrize("answer", [BUSY, "Zero Bytes were transmitted or received", UNREADABLE])
+def test_a_first_array_that_was_taken_without_a_number_is_found_by_its_name(tmp_path, monkeypatch, answer):
+    slurm = Controller(monkeypatch, [answer], {})
+    slurm.at = {2: lambda: slurm.take(slurm.scripts[-1]), 5: lambda: slurm.end(1, 0, code=0)}
+    assert [each.state for each in run(tmp_path, 1, [])] == ["done"]
+    assert len(slurm.scripts) == 1
+
+
+def test_what_was_taken_and_is_not_found_is_not_submitted_again(tmp_path, monkeypatch):
+    slurm = Controller(monkeypatch, [UNREADABLE], {})
+    (result,) = run(tmp_path, 1, [])
+    assert result.state == "failed"
+    assert "'Welcome'. squeue does not list it either" in result.reason
+    assert len(slurm.scripts) == 1
+
+
+def test_a_driver_that_stops_names_what_slurm_may_have_taken(tmp_path, monkeypatch):
+    said = list[str]()
+    slurm = Controller(monkeypatch, [UNREADABLE], {3: lambda: signal.raise_signal(signal.SIGTERM)})
+    (result,) = run(tmp_path, 1, said)
+    assert result.state == "stopped"
+    assert f"`scancel --name={slurm.scripts[0].parent.name}` ends them" in said[-1]
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "said_of"),
+    [
+        ("PENDING", "JobHeldUser", "scontrol release 1`"), ("REQUEUE_HOLD", "None", "scontrol release 1`"),
+        ("PENDING", "PartitionTimeLimit", "--slurm.time"), ("PENDING", "Priority", ""),
+    ],
+)  # fmt: skip
+def test_jobs_that_wait_for_what_time_does_not_bring_are_named_once(tmp_path, monkeypatch, state, reason, said_of):
+    said = list[str]()
+    slurm = Controller(monkeypatch, [], {})
+
+    def hold() -> None:
+        for task_id, entry in slurm.queue.items():
+            slurm.queue[task_id] = replace(entry, state=state, reason=reason)
+
+    slurm.at = {3: hold, 6: lambda: slurm.end(1, 0, code=0), 8: lambda: slurm.end(1, 1, code=0)}
+    assert [each.state for each in run(tmp_path, 2, said)] == ["done", "done"]
+    stuck = [line for line in said if "does not start" in line]
+    assert len(stuck) == bool(said_of)
+    assert all(line.startswith("SLURM does not start 1_0, 1_1 (") and said_of in line for line in stuck)
+
+
+def test_a_driver_ends_where_jobs_cannot_be_cancelled_and_names_them(tmp_path, monkeypatch):
+    said = list[str]()
+    monkeypatch.setattr(slurm_executor, "CANCEL_SECONDS", 0.05)
+    monkeypatch.setattr(slurm_executor, "CANCEL_AGAIN_SECONDS", 0.01)
+    slurm = Controller(monkeypatch, [], {})
+
+    def hold() -> None:
+        (task_id,) = slurm.queue
+        slurm.queue[task_id] = replace(slurm.queue[task_id], state="PENDING")
+
+    slurm.at = {2: hold, 4: lambda: signal.raise_signal(signal.SIGTERM)}
+    (result,) = run(tmp_path, 1, said)
+    assert result.state == "stopped"
+    assert said[0] == "stopping: block 00 will leave the queue"
+    assert "Try `scancel 1`" in said[-1]
+    assert slurm.signals.count(("1_0", "cancel")) > 1  # it is asked again
+
+
+def test_a_job_that_failed_before_its_first_line_is_quoted(tmp_path, monkeypatch):
+    slurm = Controller(monkeypatch, [], {})
+
+    def fail() -> None:
+        folder = slurm.scripts[-1].parent
+        (folder / "0.out").write_text("Traceback\nModuleNotFoundError: No module named 'vdgs'\n")
+        (folder / "0.json").unlink()
+        slurm.queue.clear()
+
+    slurm.at = {2: fail, 20: fail}
+    (result,) = run(tmp_path, 1, [])
+    assert "before its first line: ModuleNotFoundError: No module named 'vdgs' (" in result.reason
+    assert "0.out)" in result.reason
 
 
 def test_what_slurm_never_takes_fails_alone_and_says_why(tmp_path, monkeypatch):

@@ -26,7 +26,6 @@ from support.slurm import is_installed, real, stand_in
 from vdgs.config.executor_options import SlurmOptions
 from vdgs.distributed import slurm_commands
 from vdgs.distributed.executor import TaskResources
-from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError
 from vdgs.distributed.slurm_executor import make_batch_script
 
 pytestmark = [
@@ -160,31 +159,3 @@ def test_a_script_asks_for_what_a_block_needs(tmp_path):
     assert lines[-1].startswith("exec ")
     plain = make_batch_script(tmp_path / "vdgs-a", 2, TaskResources(1), SlurmOptions(), 2)
     assert not any(word in plain for word in ("--mem", "--gres", "--partition", "--account", "--time", "%2"))
-
-
-def answers(monkeypatch, **said: str | None) -> None:
-    """Let SLURM's commands say this; None: they fail."""
-
-    def call(command, check=True, environment=None):
-        text = said[command[0]]
-        if text is None:
-            raise SlurmError("no such job")
-        return text
-
-    monkeypatch.setattr(slurm_commands, "_call", call)
-    monkeypatch.setattr(slurm_commands.shutil, "which", lambda name: name if name in said else None)
-
-
-def test_what_slurm_says_is_read(monkeypatch):
-    answers(monkeypatch, squeue="12|3|RUNNING|vdgs-a-1|n07\n12|4|PENDING|vdgs-a-1|\n13|N/A|RUNNING|other|n01\n")
-    assert slurm_commands.list_queue("vdgs-a-") == [
-        QueueEntry(ArrayTaskId("12", 3), "RUNNING", "vdgs-a-1", "n07"),
-        QueueEntry(ArrayTaskId("12", 4), "PENDING", "vdgs-a-1", ""),
-    ]
-    element = ArrayTaskId("12", 3)
-    answers(monkeypatch, scontrol="JobId=15 ArrayJobId=12 JobState=NODE_FAIL Reason=NodeDown NodeList=n07\n")
-    assert slurm_commands.query_job_state(element) == JobState("NODE_FAIL", "n07")
-    answers(monkeypatch, scontrol=None, sacct="REQUEUED|n01\nCANCELLED by 1000|n07\n")
-    assert slurm_commands.query_job_state(element) == JobState("CANCELLED", "n07")
-    answers(monkeypatch, scontrol=None)
-    assert slurm_commands.query_job_state(element) is None

@@ -160,11 +160,12 @@ class place:
 
 
 def squeue(words: list[str]) -> int:
-    assert words == ["--me", "--noheader", "--array", "--format=%F|%K|%T|%j|%N"], words
+    assert words == ["--me", "--noheader", "--array", "--format=%F|%K|%T|%j|%N|%r"], words
     for folder in sorted(STATE.glob("*_*")):
         told, (number, index) = facts(folder), folder.name.split("_")
         if told["state"] in ("PENDING", "RUNNING"):
-            print("|".join([number, index, told["state"], told["name"], NODE if told["state"] == "RUNNING" else ""]))
+            node = NODE if told["state"] == "RUNNING" else ""
+            print("|".join([number, index, told["state"], told["name"], node, "None"]))
     return 0
 
 

@@ -45,6 +45,19 @@ def test_what_cannot_be_imported_is_named(error, said, tmp_path, monkeypatch, ca
     assert "pip install --force-reinstall heavy mends it; `vdgs doctor` tests all packages." in line
 
 
+@pytest.mark.parametrize(
+    "said", ["libtorch_cpu.so: failed to map segment from shared object", "_flapack.so: cannot map zero-fill pages"]
+)
+def test_a_package_for_which_memory_is_short_is_not_called_broken(said, tmp_path, monkeypatch, capsys):
+    write_package(tmp_path, "heavy", f"raise ImportError({said!r}, name='heavy._C')")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert exit_code_of("vdgs run", lambda: importlib.import_module("heavy"), "") == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"vdgs run: out of memory ({said})")
+    assert "ulimit -v" in error
+    assert "pip" not in error
+
+
 def test_the_package_below_is_named_too(tmp_path, monkeypatch, capsys):
     write_package(tmp_path, "upper", "import lower")
     write_package(tmp_path, "lower", "raise RuntimeError('module compiled against ABI version 0x1000009')")

@@ -25,6 +25,7 @@ from support.commands import vdgs
 from vdgs.config.method import CompensationConfig
 from vdgs.config.presets import PRESETS
 from vdgs.geometry.camera import Camera
+from vdgs.system.memory.memory_errors import is_out_of_memory
 from vdgs.system.memory.memory_estimate import (
     MAX_COMPENSATED_GROWTH,
     MAX_GROWTH,
@@ -37,7 +38,7 @@ from vdgs.system.memory.memory_estimate import (
     max_image_pixels,
     memory_advice,
 )
-from vdgs.system.memory.process_memory import available_memory_bytes, is_out_of_memory
+from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.training.session import memory_advice as memory_advice_module
 from vdgs.training.session import trainer as watching
 from vdgs.training.session.memory_advice import print_memory_estimate
@@ -187,6 +188,9 @@ def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monke
     [
         MemoryError("std::bad_alloc"),
         OSError(errno.ENOMEM, "Cannot allocate memory"),
+        RuntimeError("unable to mmap 400 bytes from file <x>: Cannot allocate memory (12)"),
+        ImportError("libtorch_cpu.so: failed to map segment from shared object"),
+        OSError("libgfortran.so: cannot map zero-fill pages"),
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
         RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried"),
         RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 40 bytes."),
@@ -200,6 +204,8 @@ def test_missing_memory_is_recognized(error):
 def test_other_errors_are_not_taken_for_it():
     assert not is_out_of_memory(RuntimeError("shape mismatch"))
     assert not is_out_of_memory(OSError(errno.ENOSPC, "No space left on device"))
+    noexec = "x.so: failed to map segment from shared object: Operation not permitted"
+    assert not is_out_of_memory(ImportError(noexec))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")

@@ -36,7 +36,7 @@ from vdgs.captures.tiff_channels import as_tags_say, has_alpha_channel, why_no_p
 from vdgs.captures.tiff_orientation import stored_size, without_orientation
 from vdgs.captures.xmp_packets import exif_of
 from vdgs.errors import CaptureError
-from vdgs.system.memory.process_memory import is_out_of_memory
+from vdgs.system.memory.memory_errors import is_out_of_memory
 from vdgs.system.native_messages import without_decoder_messages
 from vdgs.system.permissions import refusal
 

@@ -98,6 +98,12 @@ class TaskListener:
     def on_stopping(self, tasks: Sequence[Task]) -> None:
         """These run and were asked to save and end; no more are started."""
 
+    def on_withdrawing(self, tasks: Sequence[Task]) -> None:
+        """These wait for a place on a cluster, and were asked to leave its queue."""
+
+    def on_notice(self, text: str) -> None:
+        """What a person should know of the cluster."""
+
     def on_ended(self, task: Task, result: TaskResult) -> None:
         """It will not be started again, or never was."""
 
@@ -143,6 +149,12 @@ class LogListener(TaskListener):
     def on_stopping(self, tasks: Sequence[Task]) -> None:
         names = ", ".join(task.name for task in tasks)
         self.print_line(f"stopping: {names} will save and end (Ctrl-C again kills)", "yellow")
+
+    def on_withdrawing(self, tasks: Sequence[Task]) -> None:
+        self.print_line(f"stopping: {', '.join(task.name for task in tasks)} will leave the queue", "yellow")
+
+    def on_notice(self, text: str) -> None:
+        self.print_line(text, "yellow")
 
 
 @dataclass(frozen=True)

@@ -214,6 +214,8 @@ class _TaskScheduler:
                 self._end(self._waiting.popleft(), "stopped", "not started")
             if started := [state.task for state in self._running if state.started]:
                 self._listener.on_stopping(started)
+            if queued := [state.task for state in self._running if not state.started]:
+                self._listener.on_withdrawing(queued)
         for state in self._running:
             state.request_stop()
             if kill and state.attempt is not None:

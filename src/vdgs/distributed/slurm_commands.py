@@ -25,6 +25,20 @@ _FINAL = re.compile(
     r"|invalid (account|partition|qos|feature|constraint|node|generic resource|user|job|wckey|reservation|time|memory)",
     re.IGNORECASE,
 )
+#: What it says where it may have taken a job all the same.
+_UNCERTAIN = re.compile(r"timed out|zero bytes", re.IGNORECASE)
+#: Lines of answers. What a site prints besides (greetings, the name of a cluster) has another form.
+_SUBMITTED = re.compile(r"(\d+)(?:;\S+)?")
+_QUEUED = re.compile(r"(\d+)\|(\d+)\|([A-Z_]+)\|([^|]*)\|([^|]*)\|(.*)")
+_ACCOUNTED = re.compile(r"([A-Z_]+)(?: by \w+)?\+?\|(.*)")  # "CANCELLED by 1000"
+#: States and reasons of waiting that end when someone releases the job.
+_HELD = re.compile(r"REQUEUE_HOLD|SPECIAL_EXIT|held|JobHold", re.IGNORECASE)
+#: Reasons of waiting that end when the job asks for something else.
+_UNFIT = re.compile(
+    r"BadConstraints|Partition(Time|Node)Limit|(Assoc|QOS)(Max|Min)\w*(PerJob|PerNode)\w*"
+    r"|(Assoc|QOS)Grp(?!\w*Run)\w*Minutes\w*"
+    r"|AccountNotAllowed|Invalid(Account|QOS)|QOSNotAllowed|DependencyNeverSatisfied|ReservationDeleted"
+)
 
 
 @dataclass(frozen=True)
@@ -46,6 +60,18 @@ class QueueEntry:
     state: str
     name: str
     node: str
+    reason: str = ""
+    """Why it waits, as SLURM calls it."""
+
+    @property
+    def is_held(self) -> bool:
+        """Whether it waits until someone releases it."""
+        return not self.is_running and _HELD.search(f"{self.state} {self.reason}") is not None
+
+    @property
+    def is_unfit(self) -> bool:
+        """Whether it waits in vain for what it asks for, as long as nobody changes SLURM's limits."""
+        return self.state == "PENDING" and _UNFIT.fullmatch(self.reason) is not None
 
     @property
     def is_running(self) -> bool:
@@ -68,6 +94,20 @@ class SlurmError(VdgsError):
         """Whether it would refuse the same again."""
         return _FINAL.search(str(self)) is not None
 
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether it may have done what it was asked for."""
+        return isinstance(self, UnreadableAnswerError) or _UNCERTAIN.search(str(self)) is not None
+
+
+class UnreadableAnswerError(SlurmError):
+    """SLURM took a job, and its number is not known."""
+
+    @property
+    def is_final(self) -> bool:
+        """Whatever the words that it quotes say."""
+        return False
+
 
 def require_slurm() -> None:
     """Raise VdgsError where SLURM's commands are not there."""
@@ -76,22 +116,28 @@ def require_slurm() -> None:
 
 
 def submit(script: Path) -> str:
-    """Submit a script; the number of the job. Raises SlurmError with SLURM's own words.
+    """Submit a script; the number of the job. Raises SlurmError with SLURM's own words, UnreadableAnswerError where the
+    number is not among them.
 
     SLURM's variables, where this process is a job itself, are not passed on: sbatch would take them for requests.
     """
     environment = {key: value for key, value in os.environ.items() if key == "SLURM_CONF" or key[:6] != "SLURM_"}
-    return _call(["sbatch", "--parsable", str(script)], environment=environment).strip().split(";")[0]
+    answer = _call(["sbatch", "--parsable", str(script)], environment=environment)
+    found = [match[1] for line in answer.splitlines() if (match := _SUBMITTED.fullmatch(line.strip()))]
+    if not found:
+        raise UnreadableAnswerError(f"sbatch took it, but its answer has no line with the number: {answer.strip()!r}")
+    return found[-1]
 
 
 def list_queue(prefix: str) -> list[QueueEntry]:
     """The jobs of this user that wait or run, of arrays whose names begin with a prefix."""
-    lines = _call(["squeue", "--me", "--noheader", "--array", "--format=%F|%K|%T|%j|%N"]).splitlines()
+    lines = _call(["squeue", "--me", "--noheader", "--array", "--format=%F|%K|%T|%j|%N|%r"]).splitlines()
     entries = []
     for line in lines:
-        array, index, state, name, node = (*line.strip().split("|"), "", "", "", "")[:5]
-        if name.startswith(prefix) and index.isdecimal():
-            entries.append(QueueEntry(ArrayTaskId(array, int(index)), state, name, node))
+        found = _QUEUED.fullmatch(line.strip())
+        if found is not None and found[4].startswith(prefix):
+            array, index, state, name, node, reason = found.groups()
+            entries.append(QueueEntry(ArrayTaskId(array, int(index)), state, name, node, reason))
     return entries
 
 
@@ -105,10 +151,10 @@ def query_job_state(task_id: ArrayTaskId) -> JobState | None:
     if shutil.which("sacct") is None:
         return None
     with suppress(SlurmError):
-        text = _call(["sacct", "-X", "-n", "-P", "-D", "-j", str(task_id), "-o", "State,NodeList"]).strip()
-        if text:
-            state, _, node = text.splitlines()[-1].partition("|")
-            return JobState(state.split(" ")[0], _clean_node_name(node))  # "CANCELLED by 1000"
+        text = _call(["sacct", "-X", "-n", "-P", "-D", "-j", str(task_id), "-o", "State,NodeList"])
+        found = [match for line in text.splitlines() if (match := _ACCOUNTED.fullmatch(line.strip()))]
+        if found:
+            return JobState(found[-1][1], _clean_node_name(found[-1][2]))
     return None
 
 

@@ -12,6 +12,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -29,8 +30,9 @@ from vdgs.distributed.executor import (
 )
 from vdgs.distributed.node_check import NodeRequirements
 from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
-from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError
+from vdgs.distributed.slurm_commands import ArrayTaskId, JobState, QueueEntry, SlurmError, UnreadableAnswerError
 from vdgs.distributed.slurm_job import SlurmTaskRecord, read_task_record
+from vdgs.distributed.task_process import tail_lines
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json, write_text
 from vdgs.system.child_python import python_command
@@ -49,6 +51,16 @@ END_REASONS = {
     "DEADLINE": "its deadline",
 }  # fmt: skip
 
+#: Seconds after which a job that was cancelled and is still listed is left to SLURM (which ends a script 30 s after it
+#: asked it to end, by default), and between two times that it is asked.
+CANCEL_SECONDS, CANCEL_AGAIN_SECONDS = 120.0, 15.0
+#: What to do about jobs that SLURM does not start.
+RELEASE_REMEDY = "It is held: `scontrol release {array}` lets it go on, perhaps by an administrator."
+CHANGE_REMEDY = (
+    "Stop (Ctrl-C) and run again with what SLURM allows: --slurm.time, --slurm.partition, --slurm.account, --cpus, "
+    "--mem-gb, --slurm.sbatch-args."
+)
+
 #: The option of sbatch that names nodes to avoid.
 EXCLUDE = "--exclude="
 
@@ -66,7 +78,8 @@ class SlurmExecutor(ExecutionPolicy):
         assert self.requirements is not None
         # All go into the queue, where they wait without a driver too; SLURM limits how many run at a time.
         policy = replace(self, max_concurrent=max(1, len(tasks)))
-        return run_tasks(tasks, _SlurmEngine(self.requirements, self.options, self.max_concurrent), policy, listener)
+        engine = _SlurmEngine(self.requirements, self.options, self.max_concurrent, listener)
+        return run_tasks(tasks, engine, policy, listener)
 
 
 @dataclass
@@ -76,6 +89,10 @@ class _Submission:
     folder: Path
     attempts: list[_SlurmAttempt]
     failures: int = 0
+    is_uncertain: bool = False
+    """It may have been taken."""
+    unread: UnreadableAnswerError | None = None
+    """It was taken: it is not submitted again, but looked for in the queue."""
 
     @property
     def script(self) -> Path:
@@ -86,8 +103,17 @@ class _SlurmEngine:
     #: Nobody knows what the nodes have; SLURM refuses requests that are too large.
     max_memory_bytes = sys.maxsize
 
-    def __init__(self, requirements: NodeRequirements, options: SlurmOptions, at_once: int):
+    def __init__(
+        self,
+        requirements: NodeRequirements,
+        options: SlurmOptions,
+        at_once: int,
+        listener: TaskListener | None = None,
+    ):
         self._requirements, self._options, self._at_once = requirements, options, at_once
+        self._listener = listener or TaskListener()
+        #: What was said already.
+        self._notices = set[tuple[str, ...]]()
         self._folder = requirements.folder / "slurm"
         self._prefix = f"vdgs-{hashlib.sha256(str(requirements.folder).encode()).hexdigest()[:10]}-"
         self._failed_polls = 0
@@ -127,6 +153,31 @@ class _SlurmEngine:
             return
         for submission in list(self._unanswered):
             self._submit_again(submission)
+        self._report_stuck()
+
+    def notify(self, key: tuple[str, ...], text: str) -> None:
+        """Say something, once for each key."""
+        if key not in self._notices:
+            self._notices.add(key)
+            self._listener.on_notice(text)
+
+    def report_unknown(self, folder: Path) -> None:
+        """Say that jobs without a number may be in the queue all the same, where that is so."""
+        if any(each.folder == folder and each.is_uncertain for each in self._unanswered):
+            text = f"SLURM may have taken jobs of unknown number: `scancel --name={folder.name}` ends them."
+            self.notify((folder.name,), text)
+
+    def _report_stuck(self) -> None:
+        """Say which jobs wait for what time does not bring, and what does."""
+        stuck = defaultdict[tuple[str, str], list[QueueEntry]](list)
+        for entry in self.queue.values():
+            if entry.is_held or entry.is_unfit:
+                waits_for = entry.reason if entry.reason not in ("", "None") else entry.state
+                stuck[entry.task_id.array, waits_for].append(entry)
+        for (array, why), entries in stuck.items():
+            remedy = RELEASE_REMEDY if entries[0].is_held else CHANGE_REMEDY
+            jobs = ", ".join(str(entry.task_id) for entry in entries[:3]) + (" ..." if len(entries) > 3 else "")
+            self.notify((array, why), f"SLURM does not start {jobs} ({why}). {remedy.format(array=array)}")
 
     def _list_queue(self) -> dict[ArrayTaskId, QueueEntry]:
         return {entry.task_id: entry for entry in slurm_commands.list_queue(self._prefix)}
@@ -153,9 +204,9 @@ class _SlurmEngine:
         try:
             self._list(submission, slurm_commands.submit(submission.script))
         except SlurmError as error:
-            if not (self._has_submitted or self.queue):
+            if not (self._has_submitted or self.queue or error.is_uncertain):
                 raise VdgsError(f"SLURM does not take the jobs: {error}\nThe script: {submission.script}") from error
-            self._not_taken(submission, error)  # others are at work
+            self._not_taken(submission, error)  # others are at work, or these are
         return {task.name: attempt for (task, _), attempt in zip(group, attempts, strict=True)}
 
     def _submit_again(self, submission: _Submission) -> None:
@@ -166,6 +217,8 @@ class _SlurmEngine:
         name = submission.folder.name
         taken = next((task_id.array for task_id, entry in self.queue.items() if entry.name == name), "")
         try:
+            if submission.unread and not taken:
+                raise submission.unread
             self._list(submission, taken or slurm_commands.submit(submission.script))
         except SlurmError as error:
             submission.failures += 1
@@ -174,7 +227,11 @@ class _SlurmEngine:
     def _not_taken(self, submission: _Submission, error: SlurmError) -> None:
         """Ask again later where that may help; fail at once what SLURM refuses for good: with the nodes that it was to
         avoid, or with more than it has."""
-        if not error.is_final and submission.failures < MAX_FAILED_POLLS:
+        submission.is_uncertain |= error.is_uncertain
+        if isinstance(error, UnreadableAnswerError):
+            submission.unread = error
+        most = MAX_MISSED_POLLS if submission.unread else MAX_FAILED_POLLS
+        if not error.is_final and submission.failures < most:
             self._unanswered.append(submission)
             return
         said = f"({error}; the script: {submission.script})"
@@ -183,6 +240,8 @@ class _SlurmEngine:
 
     def _reason_of_refusal(self, attempt: _SlurmAttempt, error: SlurmError, said: str) -> tuple[str, bool]:
         """Why a job was not taken, and whether another attempt is in vain."""
+        if isinstance(error, UnreadableAnswerError):
+            return f"{error}. squeue does not list it either. The script: {attempt.folder / 'job.sh'}", True
         if not error.is_final:
             return f"SLURM, which does not take it {said}", False
         if not attempt.avoided:
@@ -238,10 +297,12 @@ class _SlurmAttempt:
     """A job of an array; the number of its array is empty until SLURM takes it."""
 
     def __init__(self, task_id: ArrayTaskId, folder: Path, engine: _SlurmEngine, avoided: frozenset[str] = frozenset()):
-        self.task_id, self._folder, self._engine, self.avoided = task_id, folder, engine, avoided
+        self.task_id, self.folder, self._engine, self.avoided = task_id, folder, engine, avoided
         self._result: AttemptResult | None = None
         self._missed_polls = self._turn = 0
         self._is_cancelled = self._is_killed = False
+        #: When it was to be cancelled first, and last (seconds of a steady clock).
+        self._cancelled_first = self._cancelled_last = 0.0
         self.start_info: AttemptStarted | None = None
 
     @property
@@ -254,10 +315,11 @@ class _SlurmAttempt:
 
     def poll(self) -> AttemptResult | None:
         if self._result is None and self.task_id.array and self._engine.is_current:
-            entry, record = self._engine.queue.get(self.task_id), read_task_record(self._folder, self.task_id.index)
+            entry, record = self._engine.queue.get(self.task_id), read_task_record(self.folder, self.task_id.index)
             if entry is not None:
                 self._missed_polls = 0
                 self._follow(entry, record)
+                self._result = self._left() if self._is_cancelled or self._is_killed else None
             else:
                 self._result = self._ended(record)
         return self._result
@@ -272,19 +334,39 @@ class _SlurmAttempt:
 
     def request_stop(self) -> None:
         if not self.task_id.array:
+            self._engine.report_unknown(self.folder)
             self._result = AttemptResult(EXIT_STOPPED)
         elif self.start_info is None:
             self._is_cancelled = True
-            slurm_commands.cancel(self.task_id)
+            self._cancel()
         else:
-            slurm_commands.signal_batch(self.task_id, "TERM")
+            with suppress(SlurmError):  # no answer: a second Ctrl-C cancels it
+                slurm_commands.signal_batch(self.task_id, "TERM")
 
     def kill(self) -> None:
         if not self.task_id.array:
             self.request_stop()
         elif not self._is_killed:
             self._is_killed = True
+            self._cancel()
+
+    def _cancel(self) -> None:
+        self._cancelled_last = time.monotonic()
+        self._cancelled_first = self._cancelled_first or self._cancelled_last
+        with suppress(SlurmError):  # no answer: it is asked again
             slurm_commands.cancel(self.task_id)
+
+    def _left(self) -> AttemptResult | None:
+        """Of a cancelled job that SLURM still lists: ask again, and in the end say so and do not wait for it."""
+        now = time.monotonic()
+        if now - self._cancelled_first > CANCEL_SECONDS:
+            array = self.task_id.array
+            text = f"SLURM still lists jobs of {array} though they were cancelled: they may run. Try `scancel {array}`."
+            self._engine.notify((array, "cancelled"), text)
+            return AttemptResult(EXIT_STOPPED)
+        if now - self._cancelled_last > CANCEL_AGAIN_SECONDS:
+            self._cancel()
+        return None
 
     def _ended(self, record: SlurmTaskRecord | None) -> AttemptResult | None:
         """How it ended; None while that may still become known."""
@@ -315,8 +397,10 @@ class _SlurmAttempt:
         node = record.node if record is not None else job.node
         where = f" {node}" if node else ""
         if record is None and job.state in ("", "FAILED"):
-            hint = f"see that it sees {self._folder} (what it printed: {self._folder / f'{self.task_id.index}.out'})"
-            return AttemptResult(None, f"an error on its node{where} before its first line; {hint}")
+            output = self.folder / f"{self.task_id.index}.out"
+            said = tail_lines(output)
+            what = f"{said[-1]} ({output})" if said else f"see that it sees {self.folder} (nothing is in {output})"
+            return AttemptResult(None, f"an error on its node{where} before its first line: {what}")
         how = END_REASONS.get(job.state, f"SLURM ({job.state})" if job.state else "SLURM, without a word")
         return AttemptResult(None, f"{how}{where}", job.state == "OUT_OF_MEMORY")
 

@@ -6,12 +6,14 @@ import re
 import sys
 from traceback import walk_tb
 
+from vdgs.system.memory.memory_errors import is_out_of_memory
+
 #: What packages are called where they are installed from, if not as they are imported.
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml"}
 #: What torch says where it was built for another numpy; packages that were built so say it in a ValueError.
 _OTHER_NUMPY = re.compile(r"numpy is not available", re.IGNORECASE)
-#: What is said where memory ends while a library is loaded, and of a backend that the environment names.
-_OF_THE_MACHINE = re.compile(r"cannot allocate memory|is not a valid value for backend", re.IGNORECASE)
+#: What is said of libraries too many for one process, and of a backend that the environment names.
+_OF_THE_PROCESS = re.compile(r"cannot allocate memory in static TLS|is not a valid value for backend", re.IGNORECASE)
 #: Where numpy hides what went wrong in a page of advice.
 _ORIGINAL = re.compile(r"original error was: *(.+)", re.IGNORECASE)
 
@@ -21,9 +23,9 @@ def broken_packages(error: BaseException) -> tuple[str, ...]:
     none where it has another reason."""
     if isinstance(error, RuntimeError) and _OTHER_NUMPY.search(str(error)):
         return "torch", "numpy"
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None):
+    if is_out_of_memory(error) or (isinstance(error, OSError) and error.errno is not None):
         return ()  # the machine's fault; ctypes finds libraries missing without a number
-    if _OF_THE_MACHINE.search(str(error)):
+    if _OF_THE_PROCESS.search(str(error)):
         return ()
     found: list[str] = []
     for frame, _ in walk_tb(error.__traceback__):

@@ -11,7 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from vdgs.system.broken_packages import explain_broken_packages
+from vdgs.system.broken_packages import explain_broken_packages, import_reason
+from vdgs.system.memory.memory_errors import is_library_out_of_memory, is_out_of_memory
 
 #: Required packages that an installation may leave out (`docs/third-party.md`), and what then does not work.
 REMOVABLE_PACKAGES = {
@@ -39,7 +40,7 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
         print(f"{name}: interrupted. {when_interrupted}", file=sys.stderr)
         return 130
     except VdgsError as error:
-        print(f"{name}: {fit(str(error))}", file=sys.stderr)
+        print(f"{name}: {_fitted(str(error), fit)}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1
     except BrokenPipeError:
         _forget_output()
@@ -47,14 +48,24 @@ def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str, fi
     except Exception as error:
         if not (what := _explain(error)):
             raise
-        print(fit(f"{name}: {what}"), file=sys.stderr)
+        print(_fitted(f"{name}: {what}", fit), file=sys.stderr)
         return 1
+
+
+def _fitted(text: str, fit: Callable[[str], str]) -> str:
+    """A message as `fit` changes it; as it is where that fails, for memory may be short here too."""
+    try:
+        return fit(text)
+    except Exception:
+        return text
 
 
 def _explain(error: Exception) -> str:
     """What an error of the machine or of the installation means, in words; empty for faults of the program."""
     if isinstance(error, ModuleNotFoundError) and error.name in REMOVABLE_PACKAGES:
         return f"{error.name} is not installed: {REMOVABLE_PACKAGES[error.name]}"
+    if isinstance(error, MemoryError | RuntimeError | ImportError | OSError) and is_out_of_memory(error):
+        return _explain_out_of_memory(error)
     if broken := explain_broken_packages(error):
         return broken
     if isinstance(error, OSError):  # a disk that is full, a folder that cannot be written: no news from a traceback
@@ -66,14 +77,16 @@ def _explain(error: Exception) -> str:
 
             what = barred_by(Path(what))  # else perhaps a file of which nobody knows whether it is there
         return f"{what}: {error.strerror or error}{_remedy(error)}"
-    if isinstance(error, MemoryError | RuntimeError):
-        from vdgs.system.memory.process_memory import is_out_of_memory
-
-        if is_out_of_memory(error):
-            reason = str(error).strip().splitlines()[0] if str(error) else "no room"
-            remedy = "Smaller photographs (--downscale 2) or fewer --jobs need less."
-            return f"out of memory ({reason}). What was saved is kept. {remedy}"
     return ""
+
+
+def _explain_out_of_memory(error: Exception) -> str:
+    reason = import_reason(error) if str(error) else "no room"
+    if is_library_out_of_memory(error):
+        remedy = "Even loading the program needs more: raise the limit (ulimit -v), or end other programs."
+    else:
+        remedy = "Smaller photographs (--downscale 2) or fewer --jobs need less."
+    return f"out of memory ({reason}). What was saved is kept. {remedy}"
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.system.records import record_from_dict, record_to_compact_dict
+from vdgs.system.scratch import remove_leftovers
 from vdgs.system.units import rough_duration
 
 #: Seconds between two writes of the file.
@@ -57,6 +58,8 @@ class StepProgress:
     def __init__(self, file: Path | None, record: StepRecord) -> None:
         self._file, self._record, self._written = file, record, -WRITE_SECONDS
         self._first: tuple[float, int] | None = None
+        if file is not None:
+            remove_leftovers(file)
 
     def __call__(self, done: int) -> StepRecord:
         """Take how many are done; what the first call tells was done before and says nothing of the pace."""

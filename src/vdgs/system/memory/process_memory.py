@@ -1,9 +1,8 @@
-"""How much memory this process takes, took at most and may still take; and what a failure to get some looks like."""
+"""How much memory this process takes, took at most and may still take."""
 
 from __future__ import annotations
 
 import ctypes
-import errno
 import gc
 import resource
 import sys
@@ -13,22 +12,6 @@ from pathlib import Path
 import psutil
 
 from vdgs.system.cgroups import cgroup_limits, slurm_memory_limit
-
-#: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
-OUT_OF_MEMORY_MESSAGES = (
-    "can't allocate memory",
-    "not enough memory",
-    "bad_alloc",
-    "Insufficient memory",
-    "CUDA out of memory",
-)
-
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an exception means that memory could not be had, in main memory or on a card."""
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-        return True
-    return any(words in str(error) for words in OUT_OF_MEMORY_MESSAGES)
 
 
 def available_memory_bytes() -> int:

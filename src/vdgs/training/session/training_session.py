@@ -16,7 +16,8 @@ from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
 from vdgs.kernels.idle_memory import trim_heap
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.checkpoints import Checkpoint, delete_checkpoints_after, load_latest_checkpoint, save_checkpoint
-from vdgs.system.memory.process_memory import is_out_of_memory, peak_memory_bytes
+from vdgs.system.memory.memory_errors import is_out_of_memory
+from vdgs.system.memory.process_memory import peak_memory_bytes
 from vdgs.system.stop_signals import catch_stop_signals
 
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
