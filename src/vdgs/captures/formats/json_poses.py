@@ -171,9 +171,9 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
 def told_size(
     size: tuple[int, int], center: tuple[float | None, float | None], file: Path, label: str, remedy: str
 ) -> tuple[int, int]:
-    """The size that a lens without one is told for, by the photograph's and the principal point: the multiple by a whole
-    number, or the part, whose middle is near it and clearly nearer than that of the next; where none is near, the size
-    whose middle it is. Raises `CaptureError` where that has not the shape of the photograph."""
+    """The size that a lens without one is told for, by the photograph's and the principal point: the whole multiple, or
+    part, whose middle is near it and clearly nearer than that of the next; where none is near, the size whose middle it
+    is. Raises `CaptureError` where that has not the shape of the photograph."""
     cx, cy = center
     if not cx or not cy or all(CENTERED[0] < c / side < CENTERED[1] for c, side in zip((cx, cy), size, strict=True)):
         return size

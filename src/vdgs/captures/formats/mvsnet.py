@@ -166,9 +166,9 @@ class _Photographs:
             raise CaptureError(
                 f"{file.parent}: the {len(theirs)} photographs are numbered from {theirs[0]} to {theirs[-1]}, and the "
                 f"{len(numbers)} cameras in {cameras} from {numbers[0]} to {numbers[-1]}: which belong together cannot "
-                f"be told, for {numbers[0]} may be the camera of {file.name}. Rename the photographs as the cameras are "
-                f"named ({labels[0]}{file.suffix} for {labels[0]}{CAMERA_END}), or take cameras and photographs that "
-                "have no partner out of the folders."
+                f"be told, for {numbers[0]} may be the camera of {file.name}. Rename the photographs as the cameras "
+                f"are named ({labels[0]}{file.suffix} for {labels[0]}{CAMERA_END}), or take cameras and photographs "
+                "that have no partner out of the folders."
             )
         return found, []
 
