@@ -492,3 +492,16 @@ def test_thumbnails_of_a_system_are_no_images_of_a_capture(tmp_path, scene):
     capture = load_capture(tmp_path, CaptureOptions())
     assert len(capture.views) == 12
     assert not any("no camera" in warning for warning in capture.warnings)
+
+
+def test_photographs_in_two_folders_beside_a_model_are_all_offered(tmp_path, scene):
+    """VastGaussian's and Mega-NeRF's train/rgbs and val/rgbs beside a model that knows no folders."""
+    write_colmap(tmp_path, scene)
+    for k, image in enumerate(sorted((tmp_path / "images").iterdir())):
+        folder = tmp_path / ("val" if k % 5 == 0 else "train") / "rgbs"
+        folder.mkdir(parents=True, exist_ok=True)
+        image.rename(folder / image.name)
+    (tmp_path / "images").rmdir()
+    with pytest.raises(CaptureError, match=r"those of train and val together: --images \.\.$"):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(images=".", up="z")).views) == len(scene.cameras)

@@ -321,3 +321,20 @@ def test_damaged_files_of_poses_are_named(tmp_path, scene, how):
         file.write_bytes(file.read_bytes()[: 300 if how == "cut" else 0])
     with pytest.raises(CaptureError, match=r"poses_bounds\.npy: .*(Copy it again)"):
         load_capture(tmp_path)
+
+
+def test_shrunk_photographs_under_other_names_take_the_points_of_the_model(tmp_path, scene):
+    """NeRF's sets: images/IMG_4026.JPG, images_4/image000.png, and a COLMAP model of the former."""
+    write_llff(tmp_path, scene)
+    write_colmap(tmp_path, scene, images=None)
+    (tmp_path / "images_4").mkdir()
+    for number, file in enumerate(sorted((tmp_path / "images").iterdir())):
+        small = cv2.resize(cv2.imread(str(file)), None, fx=0.25, fy=0.25)
+        cv2.imwrite(str(tmp_path / "images_4" / f"image{number:03d}.png"), small)
+    with pytest.raises(CaptureError, match=r"images_4 has other names .*give --images images --downscale 4 instead"):
+        load_capture(tmp_path, CaptureOptions(images="images_4"))
+    source = read_source(tmp_path, CaptureOptions(images="images_4", format="llff"))
+    assert len(source.views) == 12
+    np.testing.assert_allclose(source.points, scene.points, atol=1e-6)
+    shrunk = load_capture(tmp_path, CaptureOptions(images="images", downscale=4))
+    assert shrunk.views[0].camera.width == next(iter(scene.cameras.values())).width // 4

@@ -226,9 +226,12 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
         give = f"Give the folder of both: {shell_word(above)}"
         give = give if both else f"Say where: vdgs run {shell_word(root)} --images {shell_word(above / 'images')}"
         raise CaptureError(f"{root}: is a model alone; its photographs lie beside it. {give}")
+    whole = f"; those of {' and '.join(likely)} together: --images ." if len(likely) > 1 and "." not in named else ""
     named = named or ["FOLDER, wherever it is"]
     where = f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}"
-    raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}.")
+    raise CaptureError(
+        f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}{whole}."
+    )
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.
