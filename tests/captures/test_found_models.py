@@ -502,6 +502,6 @@ def test_photographs_in_two_folders_beside_a_model_are_all_offered(tmp_path, sce
         folder.mkdir(parents=True, exist_ok=True)
         image.rename(folder / image.name)
     (tmp_path / "images").rmdir()
-    with pytest.raises(CaptureError, match=r"those of train and val together: --images \.\.$"):
+    with pytest.raises(CaptureError, match=r"; --images \. for those of train and val together\.$"):
         load_capture(tmp_path)
     assert len(load_capture(tmp_path, CaptureOptions(images=".", up="z")).views) == len(scene.cameras)
