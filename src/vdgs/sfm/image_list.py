@@ -195,7 +195,7 @@ def _split_notes(photographs: Sequence[ImageMetadata]) -> list[str]:
         return []
     return [
         f"{trains} photographs lie in train/ and {tests} in test/ or val/: that is not kept, all are used for the "
-        "poses, and of all every n-th is for the test. To test on the set's own, name its test photographs, one a line, "
+        "poses, and of all every n-th is for the test. For the set's own test name its photographs, one a line, "
         "in a file: --test-list FILE (vdgs run, vdgs train)."
     ]
 
