@@ -26,6 +26,7 @@ from support.dataset_layouts import (
     write_matrixcity,
     write_mega_nerf,
 )
+from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -149,6 +150,33 @@ def test_matrixcity_pose_folder(tmp_path, scene):
         (tmp_path / "aerial" / "train" / "block_1" / f"000{k}.png").unlink()
     with pytest.raises(CaptureError, match=r"7 of 13 images .* are missing(?s:.)*0003\.png(?s:.)*Unpack the \.tar"):
         load_capture(root)
+
+
+@pytest.mark.parametrize(
+    ("path", "is_city"),
+    [
+        ("block_3/train/{name}", False), ("train/block_3/{name}", False), ("train/block_a/{number}.png", True),
+        ("../../train/block_3/{number}.png", True), ("small_city/aerial/{name}", True),
+        ("../../train/big_high_block_1/{number}.png", True), ("block_all/{number}.png", False),
+    ],
+)  # fmt: skip
+def test_only_matrixcitys_own_paths_have_its_unit(tmp_path, scene, path, is_city):
+    """block_3 is also what a part of any survey is called."""
+    for side, part in zip(("train", "test"), halves(scene), strict=True):
+        first = next(iter(part.cameras.values()))
+        frames = matrixcity_frames(part, "", 1.0)
+        for k, frame in enumerate(frames):
+            name = f"{side}_{k}.png"
+            frame["file_path"] = path.replace("train", side).format(name=name, number=f"{k + 9 * (side == 'test'):04d}")
+            image = tmp_path / frame["file_path"].removeprefix("../../")
+            write_images(image.parent, TinyScene({image.name: first}, scene.points, scene.colors))
+            del frame["frame_index"]
+        content = {"camera_angle_x": 2 * np.arctan(first.width / 2 / first.fx), "frames": frames}
+        (tmp_path / f"transforms_{side}.json").write_text(json.dumps(content))
+    write_ply(tmp_path / "points3D.ply", scene.points, scene.colors)
+    source = read_source(tmp_path, CaptureOptions())
+    assert len(source.views) == 12
+    assert (source.world is not None and source.world.metric) == is_city
 
 
 def test_matrixcity_blocks(tmp_path, scene):

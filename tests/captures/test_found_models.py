@@ -176,6 +176,17 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("a_calibrated_external_camera_parameters.txt", "imageName X Y Z Omega Phi Kappa\na 1", "of PIX4Dmapper"),
         ("flight.prj", "$PROJECT 4.4\n  $PROJECT_NAME : flight\n", "of Inpho"),
         ("Ori-All/Orientation-a.jpg.xml", "<ExportAPERO><OrientationConique/></ExportAPERO>", "Apero2NVM"),
+        (
+            "groundtruth.txt",
+            "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n1.5 1 2 3 0 0 0 1\n",
+            "TUM RGB-D",
+        ),
+        ("poses/00.txt", 2 * (" ".join(["1.0e+00", *11 * ["-2.5e-03"]]) + "\n"), "poses of KITTI; written as"),
+        ("calib.txt", f"P0: {' '.join(12 * ['7.188560e+02'])}\n", "lenses of KITTI"),
+        ("pose/a.txt", " ".join(["1", *11 * ["-0.25"], "0", "0.0", "0", "1.0"]), "a matrix of a photograph"),
+        ("pose/b.txt", "\n".join([*3 * ["1 0 -2e-3 4.5"], "0 0 0 1", ""]), "as transforms.json"),
+        ("bbox.txt", "-1 -1 -1 1 1 1 0.1 and no more\n", "a set of NSVF"),
+        ("gt/data.csv", "#timestamp, p_RS_R_x [m], p_RS_R_y [m]\n1,2,3\n", "poses of EuRoC"),
         ("AT/sfm_geo_desc.json", '{"is_georeferenced": true, "x": 1}', "BlocksExchange"),
     ],
 )
@@ -481,3 +492,16 @@ def test_thumbnails_of_a_system_are_no_images_of_a_capture(tmp_path, scene):
     capture = load_capture(tmp_path, CaptureOptions())
     assert len(capture.views) == 12
     assert not any("no camera" in warning for warning in capture.warnings)
+
+
+def test_photographs_in_two_folders_beside_a_model_are_all_offered(tmp_path, scene):
+    """VastGaussian's and Mega-NeRF's train/rgbs and val/rgbs beside a model that knows no folders."""
+    write_colmap(tmp_path, scene)
+    for k, image in enumerate(sorted((tmp_path / "images").iterdir())):
+        folder = tmp_path / ("val" if k % 5 == 0 else "train") / "rgbs"
+        folder.mkdir(parents=True, exist_ok=True)
+        image.rename(folder / image.name)
+    (tmp_path / "images").rmdir()
+    with pytest.raises(CaptureError, match=r"; --images \. for those of train and val together\.$"):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(images=".", up="z")).views) == len(scene.cameras)

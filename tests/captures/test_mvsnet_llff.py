@@ -220,6 +220,57 @@ def test_missing_and_spare_photographs_are_counted(tmp_path, scene):
         load_capture(tmp_path)
 
 
+def number_from(folder: Path, first: int, digits: int) -> None:
+    """Give the photographs of the cameras 0, 1, ... numbers from `first`."""
+    for file in sorted((file for file in folder.iterdir() if "masked" not in file.name), reverse=True):
+        file.rename(file.with_name(f"{int(file.stem) + first:0{digits}d}.png"))
+
+
+@pytest.mark.parametrize("images", [None, "blended_images"])
+def test_photographs_counted_from_1_are_paired_in_their_order(tmp_path, scene, images):
+    """Tanks and Temples: images/000001.jpg, ... and cams/00000000_cam.txt, ..."""
+    expected = list(write_mvsnet(tmp_path, scene).cameras.values())
+    number_from(tmp_path / "blended_images", 1, 6)
+    source = read_mvsnet(tmp_path, CaptureOptions(images=images), False)
+    assert len(source.views) == len(expected)
+    for view in source.views:
+        camera = expected[int(view.name[:6]) - 1]
+        np.testing.assert_allclose(view.camera_from_world, camera.camera_from_world, atol=1e-12)
+    assert any("counted from 0 and photographs from 1: paired in their order" in note for note in source.warnings)
+
+
+@pytest.mark.parametrize(("digits", "gone"), [(8, ()), (6, (12,)), (6, (5,)), (6, (1, 3))])
+def test_numbers_that_may_be_those_of_the_neighbours_are_refused(tmp_path, scene, digits, gone):
+    """A pose of the neighbour would pass every other check."""
+    write_mvsnet(tmp_path, scene)
+    number_from(tmp_path / "blended_images", 1, digits)
+    for number in gone:
+        (tmp_path / "blended_images" / f"{number:0{digits}d}.png").unlink()
+    with pytest.raises(CaptureError, match=r"which belong together cannot be told.*Rename the photographs"):
+        read_mvsnet(tmp_path, CaptureOptions(), False)
+
+
+def test_photographs_that_are_gone_shift_no_numbers(tmp_path, scene):
+    expected = write_mvsnet(tmp_path, scene).cameras
+    number_from(tmp_path / "blended_images", 0, 6)
+    for number in (4, 11):
+        (tmp_path / "blended_images" / f"{number:06d}.png").unlink()
+    source = read_mvsnet(tmp_path, CaptureOptions(), False)
+    assert len(source.views) == 10
+    for view in source.views:
+        camera = expected[f"00{view.name}"]
+        np.testing.assert_allclose(view.camera_from_world, camera.camera_from_world, atol=1e-12)
+
+
+def test_other_names_than_those_of_cameras_are_told_apart(tmp_path, scene):
+    """DTU: Rectified/scan1/rect_001_3_r5000.png is of Cameras/00000000_cam.txt."""
+    write_mvsnet(tmp_path, scene)
+    for file in sorted((tmp_path / "blended_images").glob("????????.png")):
+        file.rename(file.with_name(f"rect_{int(file.stem) + 1:03d}_3_r5000.png"))
+    with pytest.raises(CaptureError, match=r"none of the .* is named as one of the 12 cameras.*00000000\.png for"):
+        read_mvsnet(tmp_path, CaptureOptions(images="blended_images"), False)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
@@ -302,3 +353,20 @@ def test_damaged_files_of_poses_are_named(tmp_path, scene, how):
         file.write_bytes(file.read_bytes()[: 300 if how == "cut" else 0])
     with pytest.raises(CaptureError, match=r"poses_bounds\.npy: .*(Copy it again)"):
         load_capture(tmp_path)
+
+
+def test_shrunk_photographs_under_other_names_take_the_points_of_the_model(tmp_path, scene):
+    """NeRF's sets: images/IMG_4026.JPG, images_4/image000.png, and a COLMAP model of the former."""
+    write_llff(tmp_path, scene)
+    write_colmap(tmp_path, scene, images=None)
+    (tmp_path / "images_4").mkdir()
+    for number, file in enumerate(sorted((tmp_path / "images").iterdir())):
+        small = cv2.resize(cv2.imread(str(file)), None, fx=0.25, fy=0.25)
+        cv2.imwrite(str(tmp_path / "images_4" / f"image{number:03d}.png"), small)
+    with pytest.raises(CaptureError, match=r"images_4 has other names .*give --images images --downscale 4 instead"):
+        load_capture(tmp_path, CaptureOptions(images="images_4"))
+    source = read_source(tmp_path, CaptureOptions(images="images_4", format="llff"))
+    assert len(source.views) == 12
+    np.testing.assert_allclose(source.points, scene.points, atol=1e-6)
+    shrunk = load_capture(tmp_path, CaptureOptions(images="images", downscale=4))
+    assert shrunk.views[0].camera.width == next(iter(scene.cameras.values())).width // 4

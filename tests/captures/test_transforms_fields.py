@@ -19,7 +19,7 @@ from support.captures import (
 from support.dataset_layouts import (
     write_transforms,
 )
-from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
+from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix, told_size
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
@@ -51,6 +51,35 @@ def test_a_lens_without_a_size_is_of_the_size_that_its_principal_point_says(tmp_
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     [seen] = {(view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy) for view in load_capture(tmp_path).views}
     assert seen == pytest.approx((camera.fx, camera.fy, camera.cx + off * camera.width, camera.cy))
+
+
+@pytest.mark.parametrize(
+    ("lens", "size", "expected"),
+    [
+        ((82.900625, 66.383875), (640, 512), (160, 128)),  # DTU, its Cameras/train
+        ((331.6025, 265.5355), (640, 512), (640, 512)),
+        ((995.0, 746.0), (480, 360), (1920, 1440)),
+        ((1017.0, 763.0), (480, 360), (1920, 1440)),
+        ((320.0, 240.0), (480, 360), (480, 360)),  # a crop
+        ((360.0, 270.0), (240, 180), (720, 540)),
+        ((990.0, 745.0), (640, 480), (1920, 1440)),
+    ],
+)
+def test_the_nearest_whole_factor_is_the_size_of_a_lens_off_the_middle(lens, size, expected):
+    assert told_size(size, lens, Path("transforms.json"), "a.png", "") == expected
+
+
+def test_a_factor_that_cannot_be_told_is_refused():
+    """15 or 16 times: a principal point between the middles of both."""
+    with pytest.raises(CaptureError, match=r"of another size\. Write w"):
+        told_size((64, 48), (496.0, 372.0), Path("transforms.json"), "a.png", "Write w")
+
+
+@pytest.mark.parametrize("center", [(0.5, 0.5), (0.497, 0.512), (0.013, -0.008)])
+def test_principal_points_that_are_shares_of_the_sides_are_named(tmp_path, scene, center):
+    write_transforms(tmp_path, scene, cx=center[0], cy=center[1])
+    with pytest.raises(CaptureError, match=r"\(normalised\)\. Write it in pixels.* 32, 24 for the middle"):
+        load_capture(tmp_path)
 
 
 @pytest.mark.parametrize("center", [(64.0, 30.0), (83.0, 60.0), (-5.0, 24.0)])

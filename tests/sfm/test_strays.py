@@ -456,6 +456,14 @@ def test_what_is_done_with_other_kinds_is_said(tmp_path):
     assert off[20:-20, 20:-20].mean() < 12  # the sensor has one color of three at each pixel
 
 
+@pytest.mark.parametrize(("sides", "count"), [(("train", "test"), 1), (("train", "val"), 1), (("a", "b"), 0)])
+def test_folders_of_a_split_are_said_to_decide_nothing(tmp_path, sides, count):
+    for k in range(6):
+        picture(tmp_path / sides[k % 2] / "rgb" / f"{k}.png", cv2.GaussianBlur(pixels(k), (0, 0), 4))
+    notes = collect_images([tmp_path]).notes
+    assert sum("3 photographs lie in train/ and 3 in" in note and "--test-list FILE" in note for note in notes) == count
+
+
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_colmap_gets_pixels_of_every_format_that_is_read(tmp_path, orientation):
     """By the content of a file: COLMAP's decoder finds nothing in some formats, and reads others black."""

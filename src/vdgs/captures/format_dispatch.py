@@ -30,7 +30,7 @@ from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, is_transforms, read_transforms
 from vdgs.captures.image_files import find_images, readable_suffixes
-from vdgs.captures.name_resolution import largest_shrunk
+from vdgs.captures.name_resolution import largest_shrunk, match_stem
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
@@ -226,9 +226,14 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
         give = f"Give the folder of both: {shell_word(above)}"
         give = give if both else f"Say where: vdgs run {shell_word(root)} --images {shell_word(above / 'images')}"
         raise CaptureError(f"{root}: is a model alone; its photographs lie beside it. {give}")
+    stems = [match_stem(name) for folder in likely if folder != "." for name in find_images(root / folder)]
+    apart = len(likely) > 1 and "." not in named and len(set(stems)) == len(stems)
+    whole = f"; --images . for those of {' and '.join(likely)} together" if apart else ""
     named = named or ["FOLDER, wherever it is"]
     where = f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}"
-    raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}.")
+    raise CaptureError(
+        f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}{whole}."
+    )
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.

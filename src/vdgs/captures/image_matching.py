@@ -54,7 +54,8 @@ def match_images(
     try:
         warnings += [*refuse_many_missing(missing, len(paths), folder, options.strict), *several]
     except CaptureError as error:
-        raise CaptureError("\n".join([str(error), *several])) from None
+        shrunk = [] if any(there) else _other_names_in_shrunk(source, root, available)
+        raise CaptureError("\n".join([str(error), *several, *shrunk])) from None
     views = tuple(view for view, found in zip(source.views, there, strict=True) if found)
     source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
     named = set(paths)
@@ -71,6 +72,19 @@ def match_images(
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
     return _fitted(root, source, paths, options, warnings), len(spare)
+
+
+def _other_names_in_shrunk(source: SourceCapture, root: Path, available: ImageNameIndex) -> list[str]:
+    """What to give instead of a folder images_N whose photographs have other names than those of the model, as in sets
+    of NeRF (images/IMG_4026.JPG, images_4/image000.png)."""
+    whole, _, factor = source.images.rpartition("_")
+    if not (whole and factor.isdecimal() and available.images and (root / whole).is_dir()):
+        return []
+    originals = ImageNameIndex(find_images(root / whole))
+    if not any(originals.find(view.name) for view in source.views):
+        return []
+    first = next(iter(available.images))
+    return [f"{source.images} has other names ({first}): give --images {whole} --downscale {factor} instead."]
 
 
 def _is_mask(path: Path, stems: set[Path]) -> bool:

@@ -37,6 +37,9 @@ _REALITYSCAN = (
 _KAPTURE = "poses of Kapture; kapture_export_colmap.py makes a COLMAP model, which is read"
 _POLYCAM = "poses of Polycam; ns-process-data polycam (nerfstudio) makes transforms.json of them, which is read"
 _RECORD3D = "poses of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of them, which is read"
+_WRITE = (
+    "written as transforms.json (world from camera, axes of OpenGL, with the lens) beside the photographs they are read"
+)
 _AS_OTHERS = "a BlocksExchange, OPF or Agisoft XML file of the same project is read"
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
@@ -64,6 +67,7 @@ _OTHERS = {
     "*.mvs": "a scene of OpenMVS; the COLMAP or OpenMVG model that it was made of is read",
     "keyframes/*cameras/*.json": _POLYCAM,
     "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
+    "bbox.txt": f"a set of NSVF; its pose/*.txt and intrinsics.txt are not read; {_WRITE}",
     "cameras*.npz": "poses of IDR or NeuS; the COLMAP model that they were made of is read",
     "dataparser_transforms.json": (
         "what nerfstudio's training wrote; the transforms.json or COLMAP model that it was trained on is read"
@@ -99,6 +103,14 @@ _BY_CONTENT = (
         "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",
     ),
     (".txt", rb"\A# *kapture format", _KAPTURE),
+    (".txt", rb"# *timestamp,?\s+tx,?\s+ty,?\s+tz,?\s+qx", f"poses of TUM RGB-D; {_WRITE}"),
+    (".txt", rb"\A(?:(?:[-+.\de]+ ){11}[-+.\de]+ *\r?\n){2}", f"poses of KITTI; {_WRITE}"),
+    (".txt", rb"\Ap0: (?:[-+.\de]+ ){11}", f"lenses of KITTI; {_WRITE}"),
+    (
+        ".txt", rb"\A\s*(?:[-+.\de]+\s+){12}(?:[-+]?0(?:\.0*)?(?:e[-+]\d+)?\s+){3}1(?:\.0*)?(?:e\+?0+)?\s*\Z",
+        f"a matrix of a photograph (NSVF, NeRF-OSR, ScanNet, 7-Scenes); {_WRITE}",
+    ),
+    (".csv", rb"\A#timestamp.*p_rs_r_x", f"poses of EuRoC; {_WRITE}"),
     (
         ".txt", rb"\A\s*extrinsic\s",
         "a camera of MVSNet; the folder above is read, where these are cams/NAME_cam.txt in it, beside the photographs",

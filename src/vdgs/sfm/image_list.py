@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
@@ -48,6 +48,8 @@ HOW_TO_MAKE_NEW_POSES = (
 )
 #: So many photographs of 16 bits are decoded before work begins: they come from one camera.
 _LOOKED_AT = 3
+#: Folders in which data sets keep photographs for training, and those for the test or for validation.
+_TRAIN, _TEST = {"train", "training"}, {"test", "testing", "val", "validation"}
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,15 @@ def collect_images(
     photographs, rigs = with_sensors(photographs)
     left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
     left_out = [replace(each, file=found.renamed.get(each.name)) for each in left_out]
-    notes = [*found.notes(), *notes, *spectral, *bracketed, *rigs, *_kind_notes(photographs)]
+    notes = [
+        *found.notes(),
+        *notes,
+        *spectral,
+        *bracketed,
+        *rigs,
+        *_kind_notes(photographs),
+        *_split_notes(photographs),
+    ]
     notes += _undecodable(photographs)
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(photographs) < MIN_IMAGES:
@@ -181,6 +191,19 @@ def _undecodable(photographs: Sequence[ImageMetadata]) -> list[str]:
     if faults and len(faults) == len(looked_at) and len(deep) == len(photographs):
         raise CaptureError(faults[0])
     return [f"{fault.rstrip('.')} ({len(faults)} of {len(looked_at)} looked at)." for fault in faults[:1]]
+
+
+def _split_notes(photographs: Sequence[ImageMetadata]) -> list[str]:
+    """That folders of training and of test photographs, as data sets have them, decide nothing."""
+    folders = [{part.lower() for part in PurePosixPath(photo.name).parent.parts} for photo in photographs]
+    trains, tests = (sum(not names.isdisjoint(of) for of in folders) for names in (_TRAIN, _TEST))
+    if not (trains and tests):
+        return []
+    return [
+        f"{trains} photographs lie in train/ and {tests} in test/ or val/: that is not kept, all are used for the "
+        "poses, and of all every n-th is for the test. For the set's own test name its photographs, one a line, "
+        "in a file: --test-list FILE (vdgs run, vdgs train)."
+    ]
 
 
 def _kind_notes(photographs: Sequence[ImageMetadata]) -> list[str]:

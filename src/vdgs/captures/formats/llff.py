@@ -67,8 +67,9 @@ def read_llff(root: Path, options: CaptureOptions, needs_points: bool = True) ->
     warnings += leave_out_bad_poses(bad, len(rows), file, options.strict)
     poses = {view.name: view.camera_from_world for view in views}
     points, colors = find_sparse_points(
-        root, poses, POSES_FILE, option=" and give --format llff", images=options.images, needs_points=needs_points
-    )
+        root, poses, POSES_FILE, _original_names(root, photographs), option=" and give --format llff",
+        images=options.images, needs_points=needs_points,
+    )  # fmt: skip
     return SourceCapture(
         source="llff", images=images, views=tuple(views), points=points, colors=colors, warnings=tuple(warnings)
     )
@@ -120,6 +121,14 @@ def _photographs(folder: Path) -> list[Path]:
     """The photographs right in a folder, in the order in which LLFF has their poses: that of Python's strings."""
     files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
     return sorted(readable_images(files), key=lambda file: file.name)
+
+
+def _original_names(root: Path, photographs: list[Path]) -> dict[str, str]:
+    """The names of shrunk photographs by those of the originals of the same order, which a COLMAP model has."""
+    originals = _photographs(root / "images") if (root / "images").is_dir() else []
+    if len(originals) != len(photographs):
+        return {}
+    return {old.name: new.name for old, new in zip(originals, photographs, strict=True)}
 
 
 def _read_view(row: np.ndarray, image: Path, file: Path) -> SourceView:

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from vdgs.captures.capture import Split
-from vdgs.captures.formats.frame_photographs import FramePhotographs
+from vdgs.captures.formats.frame_photographs import IMAGE_FOLDERS, FramePhotographs
 from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
@@ -49,10 +49,10 @@ TEST_FILE, VALIDATION_FILE = "transforms_test.json", "transforms_val.json"
 POSE_UNIT_M = 100.0
 #: The rotation in per-block files is this times a rotation.
 BLOCK_ROTATION = 0.01
-#: What the folders of its blocks are called in the paths of its images.
-CITY_PATTERN = re.compile(
-    r"block_?(all|fusion|\d+|[a-z])(_test|_train)?|(small|big)_city.*|matrix_?city.*", re.IGNORECASE
-)
+#: What its cities and blocks are called in the paths of its images, whose names are numbers (0000.png).
+CITY_PATTERN = re.compile(r"(small|big)_city.*|matrix_?city.*", re.IGNORECASE)
+BLOCK_PATTERN = re.compile(r"(big_high_)?block_?(all|fusion|\d+|[a-z])(_test|_train)?", re.IGNORECASE)
+_NUMBERED = re.compile(r"\d{4,}(\.png)?", re.IGNORECASE)
 
 
 def pose_files(root: Path) -> list[tuple[Path, Split]]:
@@ -142,10 +142,16 @@ def _is_transparent(image: Path | None) -> bool:
 
 
 def _of_a_city(frame: JsonObject) -> bool:
-    """Whether a frame says that it is of MatrixCity: by its keys, or a path through one of the city's blocks."""
+    """Whether a frame says that it is of MatrixCity: by its keys, or a path through one of its cities, or to a numbered
+    photograph of a block in train/ or test/. A folder block_3 alone is also that of a part of any survey."""
     if "rot_mat" in frame or "frame_index" in frame:
         return True
-    return any(CITY_PATTERN.fullmatch(part) for part in PurePosixPath(str(frame.get("file_path", ""))).parts)
+    parts = PurePosixPath(str(frame.get("file_path", "")).replace("\\", "/")).parts
+    if any(map(CITY_PATTERN.fullmatch, parts)):
+        return True
+    folders = [part.lower() for part in parts[:-1] if part not in IMAGE_FOLDERS]
+    in_block = len(folders) > 1 and folders[-2] in ("train", "test") and BLOCK_PATTERN.fullmatch(folders[-1])
+    return bool(in_block and _NUMBERED.fullmatch(parts[-1]))
 
 
 def _missing(missing: list[str], count: int, folder: Path, strict: bool, is_city: bool) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ from vdgs.captures.formats.source_capture import (
     to_rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.image_files import read_header, readable_images, readable_suffixes
+from vdgs.captures.image_files import find_images, read_header, readable_images, readable_suffixes
 from vdgs.captures.name_resolution import ImageNameIndex, largest_shrunk
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
@@ -66,7 +66,8 @@ def camera_files(folder: Path) -> list[Path]:
 
 
 def read_mvsnet(root: Path, options: CaptureOptions, needs_points: bool = True) -> SourceCapture:
-    """The capture in MVSNet's layout. Photographs are found by the names of the cameras, else by their numbers.
+    """The capture in MVSNet's layout. Photographs are found by the names of the cameras, else by their numbers
+    or their order.
 
     Raises `CaptureError` for missing photographs and cameras that are damaged, `NoTiePoints` where no points are
     beside it, unless nothing `needs_points`.
@@ -80,20 +81,21 @@ def read_mvsnet(root: Path, options: CaptureOptions, needs_points: bool = True) 
             f"{root}: no folder of the photographs that {cameras.name}/{files[0].name} and the others are of (looked "
             f"into {', '.join(IMAGE_FOLDERS)}). Name it: --images FOLDER"
         )
-    photographs, originals = _Photographs(folder), None if beside is None else _Photographs(beside)
+    labels = [file.name.removesuffix(CAMERA_END) for file in files]
+    photographs, notes = _Photographs(folder).pair(labels, cameras)
+    _refuse_without_any(photographs, labels, folder)
+    originals = _originals(beside, labels, cameras)
     views, missing, bad = list[SourceView](), list[str](), dict[str, CaptureError]()
-    for file in files:
-        label = file.name.removesuffix(CAMERA_END)
-        image = photographs.find(label)
+    for file, label in zip(files, labels, strict=True):
+        image = photographs.get(label)
         if image is None:
             missing.append(label)
             continue
-        told_for = (originals.find(label) if originals is not None else None) or image
         try:
-            views.append(_read_view(file, image, told_for))
+            views.append(_read_view(file, image, originals.get(label, image)))
         except CaptureError as error:
             bad[image.name] = error
-    warnings = refuse_many_missing(missing, len(files), folder, options.strict)
+    warnings = notes + refuse_many_missing(missing, len(files), folder, options.strict)
     views = one_view_each(views, cameras, bad)
     warnings += leave_out_bad_poses(bad, len(files) - len(missing), cameras, options.strict)
     if others:
@@ -134,6 +136,63 @@ class _Photographs:
             return self._index.images[found]
         alike = self._numbered.get(int(label), []) if label.isdecimal() else []
         return alike[0] if len(alike) == 1 else None
+
+    def pair(self, labels: Sequence[str], cameras: Path) -> tuple[dict[str, Path], list[str]]:
+        """Of each camera, by its label, the photograph that is there, and a note where they are paired by their order.
+
+        Cameras are counted from 0, and photographs often from 1 (Tanks and Temples): where all of both are numbered
+        without gaps, equally many and not from the same number, their numbers mean their order. Raises `CaptureError`
+        where that may be so and cannot be told.
+        """
+        found = {label: image for label in labels if (image := self.find(label)) is not None}
+        if len(found) == len(labels):
+            return found, []
+        numbers = sorted(int(label) for label in labels if label.isdecimal())
+        theirs = sorted(number for number, files in self._numbered.items() if len(files) == 1)
+        if not theirs or len(numbers) != len(labels) or (numbers[0] == theirs[0] and numbers[-1] == theirs[-1]):
+            return found, []
+        by_name = any(label == image.stem for label, image in found.items())
+        is_shifted = len(numbers) == len(theirs) and _without_gaps(numbers) and _without_gaps(theirs)
+        if is_shifted and not by_name:
+            pairs = dict(zip(numbers, theirs, strict=True))
+            note = (
+                f"cameras in {cameras.name} are counted from {numbers[0]} and photographs from {theirs[0]}: paired in "
+                "their order."
+            )
+            return {label: self._numbered[pairs[int(label)]][0] for label in labels}, [note]
+        over = set(numbers) - set(theirs), set(theirs) - set(numbers)
+        if is_shifted or (found and not by_name and over[0] and (over[1] or theirs[0] > numbers[0])):
+            file = self._numbered[theirs[0]][0]
+            raise CaptureError(
+                f"{file.parent}: the {len(theirs)} photographs are numbered from {theirs[0]} to {theirs[-1]}, and the "
+                f"{len(numbers)} cameras in {cameras} from {numbers[0]} to {numbers[-1]}: which belong together cannot "
+                f"be told, for {numbers[0]} may be the camera of {file.name}. Rename the photographs as the cameras "
+                f"are named ({labels[0]}{file.suffix} for {labels[0]}{CAMERA_END}), or take cameras and photographs "
+                "that have no partner out of the folders."
+            )
+        return found, []
+
+
+def _without_gaps(numbers: Sequence[int]) -> bool:
+    return numbers[-1] - numbers[0] == len(numbers) - 1
+
+
+def _originals(folder: Path | None, labels: Sequence[str], cameras: Path) -> dict[str, Path]:
+    """The photographs beside the cameras, whose pixels the lenses are told in; none where they cannot be told."""
+    with suppress(CaptureError):
+        return {} if folder is None else _Photographs(folder).pair(labels, cameras)[0]
+    return {}
+
+
+def _refuse_without_any(photographs: dict[str, Path], labels: Sequence[str], folder: Path) -> None:
+    """Raise `CaptureError` where no photograph has the name of a camera, as in DTU's Rectified."""
+    if not photographs and (there := list(find_images(folder).values())):
+        raise CaptureError(
+            f"{folder}: none of the {len(there)} photographs ({there[0].name}, ...) is named as one of the "
+            f"{len(labels)} cameras. Copy them under the names of their cameras, {labels[0]}{there[0].suffix} for "
+            f"{labels[0]}{CAMERA_END}. DTU counts its photographs from 1 and their light last: rect_001_3_r5000.png is "
+            "of camera 00000000."
+        )
 
 
 def _camera_folders(root: Path) -> list[Path]:

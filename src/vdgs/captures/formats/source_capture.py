@@ -44,6 +44,8 @@ PINHOLE_WHEN_ZERO = {
 #: The lenses of `brown_lens`, which are none of COLMAP's.
 BROWN, GENERAL, GENERAL_FISHEYE, EQUISOLID = OWN_LENSES = ("BROWN", "GENERAL", "GENERAL_FISHEYE", "EQUISOLID")
 MAX_SIDE_PX = 100_000
+#: In images with larger sides than this a principal point within 1 of the corner is no number of pixels.
+LEAST_SIDE_PX = 4
 #: The principal point of a photograph as it was taken lies between these shares of its sides (choice).
 CENTERED = (0.3, 0.7)
 #: Names that messages list, and those of photographs that are gone, which a person must find.
@@ -288,7 +290,7 @@ def find_image(root: Path, name: str) -> Path | None:
 
 
 def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsics:
-    """The intrinsics, if they can belong to a real camera; else `CaptureError`."""
+    """The intrinsics, if they can belong to a real camera, or to a part of its image; else `CaptureError`."""
     width, height = intrinsics.width, intrinsics.height
     problem = None
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
@@ -303,6 +305,13 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
             problem = f"a principal point of {intrinsics.principal_point} for an image of {width}x{height}"
     if problem:
         raise CaptureError(f"{file}: {label} has {problem}. The file is damaged; copy or export it again.")
+    cx, cy = intrinsics.principal_point
+    if max(abs(cx), abs(cy)) <= 1 and min(width, height) > LEAST_SIDE_PX:
+        raise CaptureError(
+            f"{file}: {label} has its principal point at {cx:g}, {cy:g}, and the image is {width}x{height} pixels: it "
+            f"seems to be a share of the sides (normalised). Write it in pixels, from the upper left corner: "
+            f"{cx * width:g}, {cy * height:g} where it counts from there, {width / 2:g}, {height / 2:g} for the middle."
+        )
     return intrinsics
 
 
