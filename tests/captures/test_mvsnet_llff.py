@@ -250,6 +250,14 @@ def test_numbers_that_may_be_those_of_the_neighbours_are_refused(tmp_path, scene
         read_mvsnet(tmp_path, CaptureOptions(), False)
 
 
+def test_numbers_that_are_further_apart_are_refused(tmp_path, scene):
+    """Two photographs may be missing at one end, and two cameras at the other."""
+    write_mvsnet(tmp_path, scene)
+    number_from(tmp_path / "blended_images", 2, 6)
+    with pytest.raises(CaptureError, match="which belong together cannot be told"):
+        read_mvsnet(tmp_path, CaptureOptions(), False)
+
+
 def test_photographs_that_are_gone_shift_no_numbers(tmp_path, scene):
     expected = write_mvsnet(tmp_path, scene).cameras
     number_from(tmp_path / "blended_images", 0, 6)

@@ -58,11 +58,14 @@ def test_a_lens_without_a_size_is_of_the_size_that_its_principal_point_says(tmp_
     [
         ((82.900625, 66.383875), (640, 512), (160, 128)),  # DTU, its Cameras/train
         ((331.6025, 265.5355), (640, 512), (640, 512)),
-        ((995.0, 746.0), (480, 360), (1920, 1440)),
-        ((1017.0, 763.0), (480, 360), (1920, 1440)),
+        ((995.3, 746.2), (480, 360), (1920, 1440)),
+        ((1016.3, 762.2), (480, 360), (1920, 1440)),
         ((320.0, 240.0), (480, 360), (480, 360)),  # a crop
         ((360.0, 270.0), (240, 180), (720, 540)),
-        ((990.0, 745.0), (640, 480), (1920, 1440)),
+        ((990.3, 745.2), (640, 480), (1920, 1440)),
+        ((2000.0, 1500.0), (640, 480), (4000, 3000)),  # the middle, whatever the factor
+        ((2736.0, 1824.0), (640, 427), (5472, 3648)),
+        ((4096.0, 2730.0), (1600, 1066), (8192, 5460)),
     ],
 )
 def test_the_nearest_whole_factor_is_the_size_of_a_lens_off_the_middle(lens, size, expected):
@@ -72,7 +75,7 @@ def test_the_nearest_whole_factor_is_the_size_of_a_lens_off_the_middle(lens, siz
 def test_a_factor_that_cannot_be_told_is_refused():
     """15 or 16 times: a principal point between the middles of both."""
     with pytest.raises(CaptureError, match=r"of another size\. Write w"):
-        told_size((64, 48), (496.0, 372.0), Path("transforms.json"), "a.png", "Write w")
+        told_size((64, 48), (496.3, 372.2), Path("transforms.json"), "a.png", "Write w")
 
 
 @pytest.mark.parametrize("center", [(0.5, 0.5), (0.497, 0.512), (0.013, -0.008)])

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -56,6 +57,15 @@ def test_a_package_for_which_memory_is_short_is_not_called_broken(said, tmp_path
     assert error.startswith(f"vdgs run: out of memory ({said})")
     assert "ulimit -v" in error
     assert "pip" not in error
+
+
+def test_libraries_where_no_program_may_run_are_not_called_short_of_memory(tmp_path, monkeypatch, capsys):
+    said = f"{tmp_path}/heavy/_C.so: failed to map segment from shared object"
+    write_package(tmp_path, "heavy", f"raise ImportError({said!r}, name='heavy._C')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(os, "statvfs", lambda path: SimpleNamespace(f_flag=os.ST_NOEXEC))
+    assert exit_code_of("vdgs run", lambda: importlib.import_module("heavy"), "") == 1
+    assert f"No program may run where {tmp_path}/heavy/_C.so lies (noexec)" in capsys.readouterr().err
 
 
 def test_the_package_below_is_named_too(tmp_path, monkeypatch, capsys):

@@ -6,7 +6,7 @@ import re
 import sys
 from traceback import walk_tb
 
-from vdgs.system.memory.memory_errors import is_out_of_memory
+from vdgs.system.memory.memory_errors import barred_library, is_out_of_memory
 
 #: What packages are called where they are installed from, if not as they are imported.
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml"}
@@ -53,6 +53,8 @@ def explain_broken_packages(error: BaseException) -> str:
         return ""
     if all(each in sys.stdlib_module_names for each in packages):
         remedy = "This Python lacks a part of itself: install a whole one."
+    elif barred := barred_library(error):
+        remedy = f"No program may run where {barred} lies (noexec): install vdgs in another file system."
     else:
         remedy = f"{reinstall_command(packages)} mends it; `vdgs doctor` tests all packages."
     return f"{packages[0]} cannot be used ({import_reason(error)}). {remedy}"

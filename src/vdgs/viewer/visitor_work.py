@@ -117,8 +117,8 @@ class Visits:
 
     def begin(self, client: int, browser: str | None) -> None:
         """Somebody has come, of a browser (`AccessControl.browser_of`)."""
-        with self._lock:
-            self._visits[client] = _Visit(browser, self._clock())
+        # In one step, without the lock: viser's loop of events must not wait until another's work is restored.
+        self._visits[client] = _Visit(browser, self._clock())
 
     def welcome(self, session: Session) -> None:
         """Let a visitor whose connection was lost go on where he was, unless he is gone again."""
@@ -143,24 +143,26 @@ class Visits:
             visit = self._visits.pop(client, None)
             if visit is None or visit.session is None:
                 return
-            work, next_visit = visit.session.work(), self._next_visit(client, visit)
-            if next_visit is None or next_visit.session is None or work.is_empty:
-                self._kept.put(visit.browser, work)
-                return
+            work = visit.session.work()
             try:
-                next_visit.session.restore(work, moves=False)
+                next_visit = None if work.is_empty else self._next_visit(client, visit)
+                if next_visit is not None and next_visit.session is not None:
+                    next_visit.session.restore(work, moves=False)
+                    next_visit.was_handed_work = True
+                    return
             except BaseException:
                 self._kept.put(visit.browser, work)
                 raise
-            next_visit.was_handed_work = True
+            self._kept.put(visit.browser, work)
 
     def _next_visit(self, client: int, visit: _Visit) -> _Visit | None:
         """Where a browser seems to have come back before the end of its visit was noticed."""
         earliest = self._clock() - UNNOTICED_SECONDS
-        for number, other in sorted(self._visits.items()):
+        for number, other in sorted([*self._visits.items()], key=lambda each: each[0]):
             is_later = number > client and other.began >= earliest
             is_same = visit.browser is not None and other.browser == visit.browser
-            is_new = other.session is not None and not other.was_handed_work and other.session.work().is_empty
-            if is_later and is_same and is_new:
+            if not (is_later and is_same) or other.session is None or other.was_handed_work:
+                continue
+            if other.session.work().is_empty:
                 return other
         return None

@@ -172,8 +172,9 @@ def told_size(
     size: tuple[int, int], center: tuple[float | None, float | None], file: Path, label: str, remedy: str
 ) -> tuple[int, int]:
     """The size that a lens without one is told for, by the photograph's and the principal point: the whole multiple, or
-    part, whose middle is near it and clearly nearer than that of the next; where none is near, the size whose middle it
-    is. Raises `CaptureError` where that has not the shape of the photograph."""
+    part, of whose middle it is; else the size whose middle it is exactly, if that has the shape of the photograph; else
+    the whole multiple whose middle is near it and clearly nearer than that of the next. Raises `CaptureError` where
+    none is."""
     cx, cy = center
     if not cx or not cy or all(CENTERED[0] < c / side < CENTERED[1] for c, side in zip((cx, cy), size, strict=True)):
         return size
@@ -181,18 +182,22 @@ def told_size(
         across, down = 2 * cx / size[0], 2 * cy / size[1]
         off = {many: max(abs(across / many - 1), abs(down / many - 1)) for many in _SHRUNK}
         nearest, second = sorted(off, key=lambda many: off[many])[:2]
+        whole, doubled = (round(2 * cx), round(2 * cy)), (2 * cx, 2 * cy)
+        is_middle = max(abs(a - b) for a, b in zip(whole, doubled, strict=True)) < _ROUNDED and same_aspect(whole, size)
+        if off[nearest] > _EXACT and (is_middle or (off[nearest] > _MIDDLE and same_aspect(whole, size))):
+            return whole
         if off[nearest] <= _MIDDLE and off[second] > 2 * off[nearest]:
             return round(size[0] * nearest), round(size[1] * nearest)
-        if off[nearest] > _MIDDLE and same_aspect((round(2 * cx), round(2 * cy)), size):
-            return round(2 * cx), round(2 * cy)
     check_centered((cx, cy), size, file, label, remedy)
     return size
 
 
 _WRITE_SIZE = "Write w and h into the file, or give the photographs of that size."
-#: By whole numbers photographs are shrunk, or the file is; principal points are so near the middle, as a share of it:
-#: those of DTU are 3.7 % off.
-_SHRUNK, _MIDDLE = (1, *range(2, 17), *(1 / many for many in range(2, 17))), 0.06
+#: By whole numbers photographs are shrunk, or the file is; principal points lie in the middle, or near it, as a share
+#: of it: those of DTU are 3.7 % off.
+_SHRUNK, _EXACT, _MIDDLE = (1, *range(2, 17), *(1 / many for many in range(2, 17))), 0.01, 0.06
+#: Doubled, the middle of an image is a whole number of pixels, but for what files round.
+_ROUNDED = 1e-3
 #: Ways to say a focal length, one of which is enough.
 _FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")

@@ -141,8 +141,8 @@ class _Photographs:
         """Of each camera, by its label, the photograph that is there, and a note where they are paired by their order.
 
         Cameras are counted from 0, and photographs often from 1 (Tanks and Temples): where all of both are numbered
-        without gaps, equally many and not from the same number, their numbers mean their order. Raises `CaptureError`
-        where that may be so and cannot be told.
+        without gaps, equally many and apart by 1, their numbers mean their order. Raises `CaptureError` where that may
+        be so and cannot be told.
         """
         found = {label: image for label in labels if (image := self.find(label)) is not None}
         if len(found) == len(labels):
@@ -153,7 +153,7 @@ class _Photographs:
             return found, []
         by_name = any(label == image.stem for label, image in found.items())
         is_shifted = len(numbers) == len(theirs) and _without_gaps(numbers) and _without_gaps(theirs)
-        if is_shifted and not by_name:
+        if is_shifted and not by_name and theirs[0] - numbers[0] == 1:
             pairs = dict(zip(numbers, theirs, strict=True))
             note = (
                 f"cameras in {cameras.name} are counted from {numbers[0]} and photographs from {theirs[0]}: paired in "
