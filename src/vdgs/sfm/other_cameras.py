@@ -45,7 +45,7 @@ _LONGER = 1.2
 _SHARE_BESIDE = 0.9
 #: So far apart (metres; choice) are cameras of one moment on one drone at most.
 _SAME_PLACE_M = 30.0
-#: So many pictures of a camera, folder and size are looked at, of which more than half must show colors to be used (choice).
+#: So many pictures of a camera, folder and size are looked at; more than half must show colors to be used (choice).
 _LOOKED_AT = 5
 #: Where fewer photographs would be left, thermal pictures are what is wanted.
 LEAST_VISIBLE = 3
