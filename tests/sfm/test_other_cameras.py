@@ -125,6 +125,32 @@ def test_what_its_name_calls_thermal_is_left_out_where_it_has_the_size_of_its_se
     only_thermal_are_left_out(tmp_path, shoot(tmp_path, names), cold, "by its name and size (320 x 256)")
 
 
+@pytest.mark.parametrize(
+    ("palette", "contrast", "mark"),
+    [
+        (None, 1.0, (0, 255, 0)),
+        (cv2.COLORMAP_BONE, 1.0, None),
+        (cv2.COLORMAP_INFERNO, 0.125, None),
+        (cv2.COLORMAP_TURBO, 0.125, None),
+        (cv2.COLORMAP_JET, 1.0, (255, 255, 255)),
+    ],
+)
+def test_thermal_pictures_with_marks_and_of_few_colors_are_none_in_color(tmp_path, palette, contrast, mark):
+    """Without a sure sign of color, what name and size say is so. A cross in the middle: 1 % of the pixels."""
+    files = shoot(tmp_path, [f"IRX_{k:04d}.JPG" for k in range(COUNT)], 50, THERMAL)
+    for file in files:
+        with Image.open(file) as image:
+            exif, gray = image.getexif(), np.asarray(image.convert("L"))
+        gray = (gray * contrast + 120 * (1 - contrast)).astype(np.uint8)
+        shown = np.stack([gray] * 3, 2) if palette is None else cv2.applyColorMap(gray, palette)[..., ::-1].copy()
+        if mark:
+            shown[126:132, 130:190] = shown[99:159, 157:163] = mark
+        Image.fromarray(shown).save(file, exif=exif, quality=92)
+    only_thermal_are_left_out(
+        tmp_path, shoot(tmp_path, [f"MAX_{k:04d}.JPG" for k in range(COUNT)]), files, "by its name and size"
+    )
+
+
 @pytest.mark.parametrize("late_s", [1, 1800])
 def test_what_its_folder_calls_thermal_is_left_out_beside_a_larger_photograph_of_its_moment(tmp_path, late_s):
     """A name alone is no sign."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vdgs.captures.image_files import find_images
 from vdgs.sfm import image_list
 from vdgs.sfm.image_metadata import read_image_metadata
 from vdgs.sfm.sidecars import list_folder, with_sidecars
@@ -56,6 +57,16 @@ def test_the_json_of_another_file_that_is_there_is_not_taken(tmp_path):
     for gone, place in (("x.HEIC.json", (20.0, 5.0)), ("x.tif.json", None)):
         (tmp_path / gone).unlink()
         assert with_sidecars(photo).lat_lon == place
+
+
+@pytest.mark.parametrize("ending", ["HEIC", "heif", "avif", "DNG"])
+def test_the_json_of_a_file_that_a_jpeg_beside_it_replaces_is_taken(tmp_path, ending):
+    Image.fromarray(NOISE).save(tmp_path / "x.jpg")
+    (tmp_path / f"x.{ending}").touch()
+    place = {"geoData": {"latitude": 30.0, "longitude": 5.0}}
+    (tmp_path / f"x.{ending}.supplemental-metadata.json").write_text(json.dumps(place))
+    assert list(find_images(tmp_path)) == ["x.jpg"]
+    assert with_sidecars(read_image_metadata(tmp_path / "x.jpg", "x.jpg")).lat_lon == (30.0, 5.0)
 
 
 def test_a_folder_is_not_listed_for_each_photograph(tmp_path, monkeypatch):

@@ -33,7 +33,7 @@ def bands(folder: Path, names: list[str], xmp: str = "", size: tuple[int, int] =
         exif[0x010F], exif[0x0110] = "Maker", "Bands"
         exif.get_ifd(0x8769)[0x920A] = 5.4
         gray = np.kron(noise(k)[..., 0], np.ones((2, 2)))[: size[1], : size[0]].astype(np.uint16) * 257
-        more = {0x02BC: (xmp % k).encode()} if xmp else {}
+        more = {0x02BC: (xmp % k).encode(), 0x010F: "Maker", 0x0110: "Bands"} if xmp else {}
         Image.fromarray(gray).save(folder / name, exif=exif, tiffinfo=more)
 
 
@@ -118,6 +118,60 @@ def test_color_and_a_band_are_not_used_together(tmp_path, tags):
     if not tags:
         reasons = {each.name: each.reason for each in found.excluded}
         assert "none of the band Green" in reasons[colors[0]]
+
+
+@pytest.mark.parametrize(
+    ("band", "color"),
+    [
+        ("IMG_{:04d}_NIR.TIF", "IMG_{:04d}_RGB.JPG"),
+        ("a{:04d}_REG.TIF", "b{:04d}.JPG"),
+        ("IMG_{:04d}_1.tif", "IMG_{:04d}.jpg"),
+        ("p{:04d}_RED.TIF", "p{:04d}_RGB.JPG"),
+        ("IMG_{:04d}_1.tif", "frame{:04d}.jpg"),
+        ("shed{:04d}_RED.TIF", "frame{:04d}.jpg"),
+    ],
+)
+def test_one_band_beside_color_is_known_by_a_clear_word_or_the_photographs_of_its_shots(tmp_path, band, color):
+    colors, grays = [[name.format(k) for k in range(COUNT)] for name in (color, band)]
+    for k, name in enumerate(colors):
+        Image.fromarray(noise(k)).save(tmp_path / name, quality=95)
+    for k, name in enumerate(grays):
+        Image.fromarray(noise(20 + k)[..., 0]).save(tmp_path / name)
+    found = {photo.name for photo in collect_images([tmp_path]).images}
+    assert found == {*colors} | ({*grays} if color.startswith("frame") else set())
+
+
+@pytest.mark.parametrize(
+    ("sure", "number", "size", "color"),
+    [
+        (True, COUNT, (160, 120), False),  # maps of an index
+        (True, 2 * COUNT, (160, 120), False),
+        (True, 3 * COUNT, (160, 120), True),  # frames of a film
+        (False, COUNT, (160, 120), True),
+        (False, COUNT, (100, 100), False),  # previews
+    ],
+)
+def test_pictures_without_tags_that_may_be_made_of_a_set_are_not_used_instead(tmp_path, sure, number, size, color):
+    names = [f"x{k:02d}.png" for k in range(number)]
+    for k, name in enumerate(names):
+        Image.fromarray(noise(k)[: size[1], : size[0]]).save(tmp_path / name)
+    packet = "<Camera:BandName><rdf:Seq><rdf:li>{}</rdf:li></rdf:Seq></Camera:BandName><!-- %d -->"
+    grays = [f"IMG_{k:04d}_{band}.tif" for band in (2, 4) for k in range(COUNT)]
+    bands(tmp_path, grays)
+    if sure:
+        bands(tmp_path, grays[:COUNT], packet.format("Green"))
+        bands(tmp_path, grays[COUNT:], packet.format("NIR"))
+    used = {photo.name for photo in collect_images([tmp_path]).images}
+    assert used == ({*names} if color else {f"IMG_{k:04d}_2.tif" for k in range(COUNT)})
+
+
+@pytest.mark.parametrize("size", [(160, 120), (100, 100)])
+def test_one_picture_of_a_band_does_not_win_over_photographs_without_tags(tmp_path, size):
+    names = [f"x{k:02d}.jpg" for k in range(COUNT)]
+    for k, name in enumerate(names):
+        Image.fromarray(noise(k)[: size[1], : size[0]]).save(tmp_path / name, quality=95)
+    bands(tmp_path, ["DJI_0001_MS_NIR.TIF"])
+    assert [photo.name for photo in collect_images([tmp_path]).images] == names
 
 
 @pytest.mark.parametrize(

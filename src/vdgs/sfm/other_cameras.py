@@ -14,7 +14,7 @@ import numpy as np
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.sfm.flights import time_of
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
-from vdgs.sfm.picture_colors import looks_thermal
+from vdgs.sfm.picture_colors import looks_visible
 
 #: How DJI names what cameras of one drone take at a moment: DJI_20240329124328_0001_T, maybe with a flight behind it.
 _DJI_NAME = re.compile(
@@ -45,7 +45,7 @@ _LONGER = 1.2
 _SHARE_BESIDE = 0.9
 #: So far apart (metres; choice) are cameras of one moment on one drone at most.
 _SAME_PLACE_M = 30.0
-#: So many pictures of a camera, folder and size are looked at, of which half must look thermal (choice).
+#: So many pictures of a camera, folder and size are looked at; more than half must show colors to be used (choice).
 _LOOKED_AT = 5
 #: Where fewer photographs would be left, thermal pictures are what is wanted.
 LEAST_VISIBLE = 3
@@ -262,6 +262,6 @@ def _in_color(photographs: Sequence[ImageMetadata]) -> set[str]:
     found = set[str]()
     for taken in groups.values():
         looked_at = taken[:: -(-len(taken) // _LOOKED_AT)]
-        if 2 * sum(looks_thermal(photo.path) for photo in looked_at) < len(looked_at):
+        if 2 * sum(looks_visible(photo.path) for photo in looked_at) > len(looked_at):
             found |= {photo.name for photo in taken}
     return found

@@ -1,4 +1,4 @@
-"""What the pixels of a picture tell of the camera: gray alone, false color of a thermal one, or the colors of eyes."""
+"""What the pixels of a picture tell of the camera: gray, false color of a thermal one, or the colors of eyes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from vdgs.errors import CaptureError
 
 #: Pillow's modes of gray.
 GRAYS = ("L", "I;16", "I;16B", "I;16L")
-#: Of gray stored as color, channels differ by no more (levels), in the small picture that is looked at (pixels).
-_GRAY, _LOOKED_AT = 4, (128, 128)
+#: Of gray stored as color, channels differ by no more (levels), but for marks in color (a spot, a cross, a logo: choice
+#: of the share), in the small picture that is looked at (pixels).
+_GRAY, _GRAY_SHARE, _LOOKED_AT = 4, 0.95, (128, 128)
 #: Of false color, levels scatter no more along its palette than so much of the whole. Measured: palettes as JPEG 0.04
 #: to 0.20, photographs 0.32 to 1.
 _ON_CURVE = 0.25
-#: Less color, or less contrast, tells no palette (levels, standard deviation).
+#: Less color, or less contrast, tells nothing (levels, standard deviation).
 _LEAST_SPREAD = 10.0
 #: Hues are compared where so much of a picture has color: a distance of so many levels from gray.
 _COLORED, _LEAST_CHROMA = 0.8, 10.0
@@ -25,27 +26,30 @@ _LEVELS, _HUES = 24, 48
 
 
 def shows_gray(path: Path) -> bool:
-    """Whether a picture shows gray alone, by some of its pixels, though it may be stored in color."""
+    """Whether a picture shows gray, but for marks, by some of its pixels, though it may be stored in color."""
     colors = _small(path)
     return colors is not None and _is_gray(colors)
 
 
-def looks_thermal(path: Path) -> bool:
-    """Whether a picture is gray or in the false color of a palette; False for one that cannot be looked at.
+def looks_visible(path: Path) -> bool:
+    """Whether a picture shows the colors of eyes for sure: it is neither gray, nor of few colors or little
+    contrast, nor in the false color of a palette. False for one that cannot be looked at.
 
     The colors of a palette lie on one curve. Along it, brightness tells the color (iron), or the hue tells the
     brightness (rainbow); in photographs neither does.
     """
     colors = _small(path)
     if colors is None or _is_gray(colors):
-        return colors is not None
+        return False
     light, *chroma = np.asarray(Image.fromarray(colors).convert("YCbCr"), np.float64).reshape(-1, 3).T - 128
     blue, red = chroma
+    if min(light.std(), float(np.sqrt(np.var(chroma, axis=1).sum()))) < _LEAST_SPREAD:
+        return False
     if _follows(np.stack(chroma, 1), light, _LEVELS):
-        return True
+        return False
     colored = np.hypot(blue, red) > _LEAST_CHROMA
     hue = np.arctan2(red, blue)
-    return bool(colored.mean() > _COLORED) and _follows(light[colored, None], hue[colored], _HUES)
+    return bool(colored.mean() <= _COLORED) or not _follows(light[colored, None], hue[colored], _HUES)
 
 
 def _small(path: Path) -> np.ndarray | None:
@@ -61,7 +65,7 @@ def _small(path: Path) -> np.ndarray | None:
 
 
 def _is_gray(colors: np.ndarray) -> bool:
-    return bool(np.ptp(colors.astype(int), axis=2).max() <= _GRAY)
+    return bool((np.ptp(colors, axis=2) <= _GRAY).mean() >= _GRAY_SHARE)
 
 
 def _follows(values: np.ndarray, along: np.ndarray, bins: int) -> bool:

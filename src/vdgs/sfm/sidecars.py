@@ -73,11 +73,17 @@ def _beside(file: Path) -> str:
 
 def _takeout_files(path: Path, beside: Mapping[str, Path]) -> list[Path]:
     """Takeout's JSON of a photograph, as it is called today and was until 2024; of another ending, that of what the
-    photograph was converted from, unless that is there, too."""
+    photograph was converted from, unless that is used, too: beside a JPEG, what phones take is not."""
     stem = unicodedata.normalize("NFC", path.stem)
     if own := [beside[name] for name in _json_names(stem, path.suffix) if name in beside]:
         return own
-    endings = [each for suffix in _CONVERTED for each in (suffix, suffix.upper()) if f"{stem}{each}" not in beside]
+    replaces = path.suffix.lower() in IMAGE_SUFFIXES
+    endings = [
+        each
+        for suffix in _CONVERTED
+        for each in (suffix, suffix.upper())
+        if f"{stem}{each}" not in beside or (replaces and suffix not in IMAGE_SUFFIXES)
+    ]
     return [beside[name] for ending in endings for name in _json_names(stem, ending) if name in beside]
 
 

@@ -10,11 +10,13 @@ from vdgs.sfm.picture_colors import GRAYS, shows_gray
 from vdgs.sfm.xmp import text
 
 #: What makers put behind the name of a picture of one band (DJI Mavic 3M; Parrot Sequoia), and the names of bands.
-_TAILS = re.compile(r".+?_(?:MS_(?P<dji>G|R|RE|NIR)|(?P<sequoia>GRE|RED|REG|NIR))", re.IGNORECASE)
+_TAILS = re.compile(r"(?P<shot>.+?)_(?:MS_(?P<dji>G|R|RE|NIR)|(?P<sequoia>GRE|RED|REG|NIR))", re.IGNORECASE)
 _BANDS = {"G": "Green", "R": "Red", "RE": "Red edge", "NIR": "NIR", "GRE": "Green", "RED": "Red", "REG": "Red edge"}
 #: MicaSense: IMG_0001_1.tif to IMG_0001_5.tif; what lies behind these differs from model to model.
 _NUMBERED = re.compile(r"IMG_\d{4,}_(?P<number>\d{1,2})", re.IGNORECASE)
 BY_NUMBER = "band "
+#: Bands whose words in names mean nothing else.
+CLEARLY_NAMED = ("NIR", "Red edge")
 MICASENSE = ("Blue", "Green", "Red", "NIR", "Red edge")
 
 
@@ -22,6 +24,15 @@ def is_surely_of_band(path: Path, xmp: Mapping[str, str]) -> bool:
     """Whether more than a name that others use, too (`shed_red`, `IMG_0001_2`), speaks for a band."""
     tail = _TAILS.fullmatch(path.stem)
     return bool(text(xmp, "BandName") or (tail and tail["dji"]))
+
+
+def shot_of(path: Path) -> str:
+    """The name of a picture without what tells the one of a shot: IMG_0001_NIR, IMG_0001_RGB, IMG_0001_2, IMG_0001."""
+    stem = path.stem.upper()
+    if _NUMBERED.fullmatch(stem):
+        return stem.rpartition("_")[0]
+    tail = _TAILS.fullmatch(stem)
+    return tail["shot"] if tail else stem.removesuffix("_RGB")
 
 
 def band_of(path: Path, mode: str, xmp: Mapping[str, str]) -> str:
