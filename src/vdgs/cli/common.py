@@ -33,7 +33,7 @@ class QuietArguments:
     """What every verb that prints takes."""
 
     quiet: bool = False
-    """Print nothing but notes, warnings and errors, and what --dry-run is asked for."""
+    """Print nothing but notes, warnings, errors and dry runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
