@@ -114,10 +114,10 @@ def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
         file.write_bytes("\r\n".join(rows).encode(encoding))
         assert read_gcp_list(file, collection, ()).points == sound.points
     units = [
-        [f"{float(x) / 1e3!r}", f"{float(y) / 1e3!r}", f"{float(z) / 0.3048!r}", *rest] for x, y, z, *rest in lines
+        [f"{float(x) / 1e3!r}", f"{float(y) / 1e-2!r}", f"{float(z) / 0.3048!r}", *rest] for x, y, z, *rest in lines
     ]
     named = [",".join([*line[:-1], f"CHK-{line[-1]}"]) for line in units]
-    file.write_text("\n".join([f"{head[0]} # of May", "x [km],y [km],z (ft),px,py,photograph,name", *named]))
+    file.write_text("\n".join([f"{head[0]} # of May", "x [km],y [cm],z (ft),px,py,photograph,name", *named]))
     found = read_gcp_list(file, collection, ())
     assert all(point.is_check_point for point in found.points)
     assert "held out as check points" in "".join(found.notes)
@@ -135,20 +135,35 @@ def test_heights_of_a_system_in_feet_are_converted_once(flight, tmp_path, headin
     assert heights == pytest.approx([182.88] * 3, abs=1e-3)
 
 
-def test_marks_that_are_left_with_one_photograph_keep_their_place():
-    """Three marks in one photograph, one in another: without the worst no other place is shown."""
+def looking_down(*names: str) -> pycolmap.Reconstruction:
+    """A model of photographs straight down from 50 m, 10 m apart along a line, the first 10 m east of the origin."""
     model, turn = pycolmap.Reconstruction(), np.diag([1.0, -1, -1])
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(model="PINHOLE", width=4000, height=3000, params=[3000, 3000, 2000, 1500], camera_id=1)
     )
-    for k, name in enumerate("AB", 1):
+    for k, name in enumerate(names, 1):
         pose = pycolmap.Rigid3d(np.column_stack([turn, -turn @ [10.0 * k, 0, 50]]))
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=k), pose)
+    return model
+
+
+def test_marks_that_are_left_with_one_photograph_keep_their_place():
+    """Three marks in one photograph, one in another: without the worst no other place is shown."""
     marks = (("A", (2300.0, 1500.0)), ("A", (2305.0, 1505.0)), ("A", (2310.0, 1500.0)), ("B", (1700.0, 2000.0)))
     point = GroundControlPoint("P", (0, 0, 0), tuple(GcpObservation(*mark) for mark in marks), False)
-    found = triangulate(model, point)
+    found = triangulate(looking_down(*"AB"), point)
     assert found.agreeing == point.observations
     assert found.error_px == found.kept_px > 100
+
+
+def test_a_mark_some_pixels_off_moves_a_point_less_than_by_its_share():
+    """One of six, 7 pixels across the line: too near to be left out, too far to count as the others do."""
+    model, off_px = looking_down(*"ABCDEF"), 7.0
+    marks = [GcpObservation(name, (2000.0 + 3000 * (35 - 10 * k) / 50, 1500.0)) for k, name in enumerate("ABCDEF", 1)]
+    marks[2] = replace(marks[2], pixel=(marks[2].pixel[0], 1500 + off_px))
+    found = triangulate(model, GroundControlPoint("P", (0, 0, 0), tuple(marks), False))
+    assert len(found.agreeing) == 6
+    assert np.linalg.norm(found.position - [35, 0, 0]) * 3000 / 50 < 0.5 * off_px / 6
 
 
 def test_heights_that_are_not_known_are_told_from_zeros(flight, tmp_path):
