@@ -15,7 +15,7 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.geometry.similarity import Similarity
 from vdgs.sfm import georeferencing, georegistration
-from vdgs.sfm.bending import bend_to_positions, tell_level
+from vdgs.sfm.bending import _tears, bend_to_positions, tell_level
 from vdgs.sfm.gcp_list import GcpList, GcpObservation, GroundControlPoint
 from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.georegistration import Georegistration
@@ -141,6 +141,16 @@ def test_a_bowl_is_flattened_by_positions(bent):
     off = centers - places
     assert bent == [True]
     assert np.sqrt(((off - [0, 0, off[:, 2].mean()]) ** 2).sum(axis=1).mean()) < 0.05  # 0 is the ground's height
+
+
+@pytest.mark.parametrize(("moved_m", "is_torn"), [(4.0, False), (20.0, True)])
+def test_a_model_is_torn_once_cameras_move_by_a_part_of_their_height(moved_m, is_torn):
+    """Though all of it moves alike, so that photographs fit as well as before."""
+    places = np.array([[20.0 * (k % 3), 20.0 * (k // 3), 80] for k in range(6)])
+    model, _ = flown_model(places, np.random.default_rng(0))
+    moved = pycolmap.Reconstruction(model)
+    georegistration.transform_model(moved, Similarity(1.0, np.eye(3), np.array([0.6, 0, 0.8]) * moved_m))
+    assert _tears(model, moved) == (pytest.approx(moved_m) if is_torn else None)
 
 
 def test_a_line_is_one_though_a_position_lies_beside_it():
