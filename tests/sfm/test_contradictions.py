@@ -3,6 +3,7 @@ as large as what nothing decides."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,9 @@ from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.up_axis import up_by_views
-from vdgs.sfm.georegistration import _checked_on_a_line
+from vdgs.sfm.flights import altitude_offsets
+from vdgs.sfm.georegistration import _checked_on_a_line, accuracy_of
+from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.recorded_headings import checked_by_headings
 
@@ -214,6 +217,31 @@ def test_altitudes_in_feet_or_of_the_wrong_sign_are_named_by_what_they_differ_by
     assert apart == pytest.approx(off, rel=0.05)
     assert wrong_reading(heights + np.repeat([0, 12.0], 10), heights) == ("", 0.0)
     assert wrong_reading(factor * np.full(20, 500.0), np.full(20, 30.0)) == ("", 0.0)
+
+
+@pytest.mark.parametrize("datum_m", [-20.0, 20.0])
+@pytest.mark.parametrize(("up_std", "right"), [((3.0, 0.02), 1), ((0.02, 3.0), 0), ((3.0, 3.0), 0), ((0.02, 0.02), 0)])
+def test_heights_are_those_of_the_flight_with_rtk_or_else_of_the_largest(up_std, right, datum_m):
+    """Whichever of the two is higher: 12 photographs, and 8 over the same places."""
+    flights = np.repeat([0, 1], [12, 8])
+    places = np.array([[15.0 * (k % 4), 15.0 * (k // 4 % 3), 60] for k in range(20)])
+    recorded = places + np.outer(flights, [0, 0, datum_m])
+    offsets = altitude_offsets(places, recorded, flights, 1.0, np.array(up_std)[flights])
+    assert offsets is not None
+    assert (offsets.reference == (flights == right)).all()
+    assert offsets.by_position == pytest.approx(datum_m * (flights - right))
+
+
+@pytest.mark.parametrize(("north", "level"), [(12.0, 3.0), (250.0, 400.0)])
+def test_angles_of_the_accuracy_are_degrees_up_to_half_a_turn(north, level):
+    places = np.array([[15.0 * (k % 4), 15.0 * (k // 4), 60] for k in range(12)])
+    fit = replace(fit_of(places, places, views(1.0)), north_error_deg=north, level_error_deg=level)
+    positions = GpsPriors(
+        image_indices=np.arange(12), enu=places, gps_std=np.ones((12, 3)), origin=(0.0, 0.0, 0.0),
+        altitude_reference="", source="EXIF", notes=(),
+    )  # fmt: skip
+    accuracy = accuracy_of(fit, positions)
+    assert (accuracy.north_deg, accuracy.level_deg) == (min(180, north), min(180, level))
 
 
 @pytest.mark.parametrize("drift_m", [0.0, 8.0, 17.0])
