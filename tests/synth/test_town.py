@@ -111,7 +111,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_off_path_views_are_apart_and_true(capture: Path) -> None:
+def test_off_path_views_are_apart_and_true(capture: Path, town: Town) -> None:
     chosen = {kind: load_capture(capture, CaptureOptions(validation=kind)).off_path_views for kind in (False, True)}
     sets = [f"{name}/{name}_{number:04d}.jpg" for name in ("low_oblique", "outside", "street") for number in (1, 2)]
     assert [[view.name for view in chosen[kind]] for kind in (False, True)] == [sets[::2], sets[1::2]]
@@ -127,6 +127,10 @@ def test_off_path_views_are_apart_and_true(capture: Path) -> None:
     low, _, street = read.off_path_views
     assert np.degrees(np.arccos(-low.camera.forward[2])) == pytest.approx(60, abs=2)
     assert np.degrees(np.arccos(-street.camera.forward[2])) > 80
+    for image in pycolmap.Reconstruction(str(capture / "off_path" / "sparse" / "0")).images.values():
+        x, y, z = image.projection_center()
+        if image.name.startswith("street"):  # as held by a person, in metres
+            assert 1.5 < z - float(town.terrain.height_without_ponds(x, y)) < 3
 
 
 def test_off_path_figures_count_what_three_photographs_see(capture: Path, tmp_path: Path) -> None:
