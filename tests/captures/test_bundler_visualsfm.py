@@ -1,0 +1,131 @@
+"""Models of Bundler and VisualSFM: a known flight in each, read back to its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from support import project_writers as writers
+from support.known_flight import (
+    BentLens,
+    KnownFlight,
+    MeasuredLens,
+    known_flight,
+)
+from support.project_reading import OPTIONS, check_numbers, check_tie_points, read
+from vdgs.captures.capture_root import capture_root
+from vdgs.captures.format_dispatch import read_source
+from vdgs.errors import CaptureError
+
+
+@pytest.fixture
+def flight() -> KnownFlight:
+    return known_flight()
+
+
+def test_bundler_in_its_own_layout_is_read_by_folder_and_by_file(tmp_path: Path, flight: KnownFlight) -> None:
+    """The list and the photographs in the root, the model in bundle/."""
+    file = writers.write_bundler(tmp_path / "bundle", flight)
+    flight.write_photographs(tmp_path)
+    (tmp_path / "list.txt").write_text("\n".join(flight.names))
+    (tmp_path / "bundle" / "list.txt").unlink()
+    assert capture_root(file) == tmp_path
+    assert len(read_source(file, OPTIONS).views) == len(read_source(tmp_path, OPTIONS).views) == len(flight.names)
+    header, counts, *_ = file.read_text().splitlines()
+    nothing = ["0 0 0"] * 5 * int(counts.split()[0])
+    file.write_text("\n".join([header, f"{counts.split()[0]} 0", *nothing]))
+    with pytest.raises(CaptureError, match="no camera of it has a pose"):
+        read_source(file, OPTIONS)
+
+
+def test_bundler_is_read_to_its_numbers(tmp_path: Path) -> None:
+    flight = known_flight(BentLens(center=(400.0, 300.0), k=(-0.11, 0.034, 0.0, 0.0), p=(0.0, 0.0)))
+    writers.write_bundler(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "bundler")
+    check_numbers(source, flight, placed=False)
+    assert (source.colors == flight.colors).all()
+    assert sum(view.observations is not None for view in source.views) == len(flight.names)
+
+
+@pytest.mark.parametrize("radial", [0.12, -0.08, 0.0])
+@pytest.mark.parametrize("matrix", [False, True])
+def test_visualsfm_is_read_to_its_numbers(tmp_path: Path, radial: float, matrix: bool) -> None:
+    flight = known_flight(MeasuredLens(radial=radial))
+    flight.write_photographs(tmp_path / "images")
+    writers.write_visualsfm(tmp_path, flight, matrix=matrix)
+    check_tie_points(read(tmp_path, "visualsfm"), flight)
+
+
+def test_a_calibration_that_visualsfm_held_is_read_to_its_numbers(tmp_path: Path) -> None:
+    flight = known_flight(MeasuredLens(radial=0.0))
+    flight.write_photographs(tmp_path / "images")
+    file = writers.write_visualsfm(tmp_path, flight)
+    file.write_text(file.read_text().replace("NVM_V3 \n", "NVM_V3 FixedK 700 401 710 302 0\n", 1))
+    lens = read(tmp_path, "visualsfm").views[0].intrinsics
+    assert (lens.focal, lens.principal_point) == ((700.0, 710.0), (401.0, 302.0))
+
+
+def test_a_lens_of_visualsfm_that_folds_over_is_named(tmp_path: Path) -> None:
+    flight = known_flight(MeasuredLens(radial=0.0))
+    flight.write_photographs(tmp_path / "images")
+    file = writers.write_visualsfm(tmp_path, flight)
+    file.write_text(file.read_text().replace(" 0.0 0.0\n", " -2.5 0.0\n", 1))
+    [said] = [each for each in read(tmp_path, "visualsfm").warnings if "cannot be used" in each]
+    assert "folds over" in said
+    assert flight.names[0] in said
+
+
+@pytest.mark.parametrize("program", ["bundler", "visualsfm", "visualsfm FixedK"])
+def test_shrunk_photographs_are_told_by_the_pixels_of_a_file_without_sizes(tmp_path: Path, program: str) -> None:
+    """The focal length is that of the photographs that were aligned; photographs of half the size would be misread."""
+    flight = known_flight(MeasuredLens(radial=0.0, k=(0.0, 0.0, 0.0, 0.0)))
+    name, _, fixed = program.partition(" ")
+    file = getattr(writers, f"write_{name}")(tmp_path, flight)
+    if fixed:
+        file.write_text(file.read_text().replace("NVM_V3 \n", "NVM_V3 FixedK 700 400 700 300 0\n", 1))
+    flight.write_photographs(tmp_path / "images")
+    assert len(read(tmp_path, name).views) == len(flight.names)
+    for path in (tmp_path / "images").rglob("*.*"):
+        Image.new("RGB", (400, 300)).save(path)
+    with pytest.raises(CaptureError, match=r"photograph is 400x300: it is of another size\. Give the photographs that"):
+        read(tmp_path, name)
+
+
+def test_photographs_that_bundler_did_not_place_are_named(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_bundler(tmp_path, flight)
+    lines = file.read_text().splitlines()
+    lines[2:7] = ["0 0 0", "0 0 0", "0 0 0", "0 0 0", "0 0 0"]
+    file.write_text("\n".join(lines))
+    flight.write_photographs(tmp_path / "images")
+    source = read(tmp_path, "bundler")
+    assert len(source.views) == len(flight.names) - 1
+    assert any("not aligned" in note and flight.names[0] in note for note in source.warnings)
+
+
+def test_list_of_bundler_must_name_every_camera(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_bundler(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    (tmp_path / "list.txt").write_text("only.jpg\n")
+    with pytest.raises(CaptureError, match=r"list\.txt names 1"):
+        read(tmp_path, "bundler")
+    (tmp_path / "list.txt").unlink()
+    with pytest.raises(CaptureError, match=r"no list\.txt"):
+        read(tmp_path, "bundler")
+    (tmp_path / "export.imagelist").write_text("".join(f"C:\\card\\{name}\n" for name in flight.names))
+    assert len(read(tmp_path, "bundler").views) == len(flight.names)
+
+
+def test_names_in_the_list_of_bundler_may_hold_blanks(tmp_path: Path, flight: KnownFlight) -> None:
+    """Bundler itself writes a guess of the focal length behind each."""
+    flight = replace(flight, names=[f"flight 1/DJI {k}.jpg" for k in range(len(flight.names))])
+    writers.write_bundler(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    assert [view.name for view in read(tmp_path, "bundler").views] == sorted(flight.names)
+    plain = replace(flight, names=[name.replace(" ", "_") for name in flight.names])
+    plain.write_photographs(tmp_path / "images")
+    (tmp_path / "list.txt").write_text("".join(f"images/{name} 0 700.5\n" for name in plain.names))
+    assert [view.name for view in read(tmp_path, "bundler").views] == sorted(plain.names)
