@@ -1,5 +1,5 @@
-"""Projects of OpenSfM, ODM, OpenMVG, Meshroom and Pix4D: a known flight in each, read back to its numbers; and what holds
-of all formats, damaged files too. Bundler and VisualSFM alone: test_bundler_visualsfm.py."""
+"""Projects of OpenSfM, ODM, OpenMVG, Meshroom and Pix4D: a known flight in each, read back to its numbers; and what
+holds of all formats, damaged files too. Bundler and VisualSFM alone: test_bundler_visualsfm.py."""
 
 from __future__ import annotations
 
