@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -190,47 +190,77 @@ def adjust_to_gcps(
     are seen by placed photographs, or they lie along a line.
     """
     targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
-    used = [(k, seen) for k, seen in located.items() if not gcps.points[k].is_check_point]
-    wrong = [k for k, seen in used if seen.kept_px > _useless_px(model)]
-    few = 2 * len(wrong) >= len(used) or len(used) - len(wrong) < MIN_CONTROL_POINTS
-    marked = _other_marks(model, gcps) if few and doubts is not None else ""
-    if marked:
-        raise CaptureError(f"{gcps.source}: its marks fit the photographs only if {marked}. {ANYWAY_GCP}")
-    used = [(k, seen) for k, seen in used if k not in wrong]
-    depth = _depth_beside_surface(model, gcps, used)
-    if doubts is not None and not 1 / DEPTHS_APART < depth < DEPTHS_APART:
+    control = {k: seen for k, seen in located.items() if not gcps.points[k].is_check_point}
+    wrong = [k for k, seen in control.items() if seen.kept_px > _useless_px(model)]
+    used = {k: seen for k, seen in control.items() if k not in wrong}
+    if doubts is not None:
+        _check_marks(model, gcps, used, len(wrong))
+    rows = np.array(list(used), int)
+    _check_enough(targets[rows], len(wrong), gcps.source)
+    places = np.array([seen.position for seen in used.values()])
+    fit = fit_surveyed(places, targets[rows], level, _pixel_at(model, list(used.values())))
+    said = doubts(fit.similarity, places[fit.trusted], fit.aims[fit.trusted]) if doubts is not None else ""
+    if said:
+        raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
+    transform_model(model, fit.similarity)
+    accuracy, notes = fit.accuracy, tuple[str, ...]()
+    firm = fit.trusted & fit.known
+    if fit.is_level:
+        accuracy, notes = _levelled_accuracy(fit, level), (_levelled_note(fit, level),)
+    elif is_collinear(fit.aims[firm]):
+        notes = ("too few control points with heights fit the others to bend the model; it is not bent.",)
+    else:
+        aims = [(located[k].agreeing, targets[k]) for k in rows[firm].tolist()]
+        model, notes = bend_to_points(model, aims, fix_focal, threads)
+    kept = rows[fit.trusted].tolist()
+    doubtful = frozenset(gcps.points[k].name for k in (*rows[~fit.trusted].tolist(), *wrong))
+    return Surveyed(
+        model=model,
+        how=f"{len(kept)} control points ({gcps.source}, {gcps.crs})",
+        doubtful=doubtful,
+        accuracy=_accuracy_as_left(accuracy, model, gcps, kept, targets),
+        notes=notes,
+    )
+
+
+def _check_marks(
+    model: pycolmap.Reconstruction, gcps: GcpList, used: Mapping[int, TriangulatedPoint], num_wrong: int
+) -> None:
+    """Raise CaptureError for marks that must be read otherwise to fit, or that meet beside the surface."""
+    few = num_wrong >= len(used) or len(used) < MIN_CONTROL_POINTS
+    otherwise = _other_marks(model, gcps) if few else ""
+    if otherwise:
+        raise CaptureError(f"{gcps.source}: its marks fit the photographs only if {otherwise}. {ANYWAY_GCP}")
+    depth = _depth_beside_surface(model, used.values())
+    if not 1 / DEPTHS_APART < depth < DEPTHS_APART:
         raise CaptureError(
             f"{gcps.source}: its marks meet {depth:.2g} times as far from the cameras as what the photographs show "
             f"there. Are they pixels of photographs of another size, or of other points? {ANYWAY_GCP}"
         )
-    rows = np.array([k for k, _ in used], int)
-    _check_enough(targets[rows], len(wrong), gcps.source)
-    places = np.array([seen.position for _, seen in used])
-    fit = fit_surveyed(places, targets[rows], level, _pixel_at(model, [seen for _, seen in used]))
-    known, trusted, accuracy = fit.known, fit.trusted, fit.accuracy
-    said = doubts(fit.similarity, places[trusted], fit.aims[trusted]) if doubts is not None else ""
-    if said:
-        raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
-    transform_model(model, fit.similarity)
-    notes: tuple[str, ...] = ()
-    kept, firm = rows[trusted].tolist(), rows[trusted & known].tolist()
-    if fit.is_level:
-        across = accuracy.place_m[:1] if accuracy.place_m else ()
-        up_m = () if level.gps_up_m is None or known.any() else (level.gps_up_m,)
-        accuracy = replace(accuracy, place_m=(*across, *up_m), level_deg=2 * level.deviation_deg)
-        by = "points with heights" if known.any() else "GPS" if level.gps is not None else "nothing"
-        notes = (f"too few control points have heights to level or to bend the model: heights are by {by}.",)
-    elif is_collinear(fit.aims[trusted & known]):
-        notes = ("too few control points with heights fit the others to bend the model; it is not bent.",)
-    else:
-        model, notes = bend_to_points(model, [(located[k].agreeing, targets[k]) for k in firm], fix_focal, threads)
+
+
+def _levelled_accuracy(fit: SurveyedFit, level: Level) -> AccuracyFacts:
+    """The accuracy of a model that its points do not level, as far as `level` says how it lies."""
+    across = fit.accuracy.place_m[:1] if fit.accuracy.place_m else ()
+    up_m = () if level.gps_up_m is None or fit.known.any() else (level.gps_up_m,)
+    return replace(fit.accuracy, place_m=(*across, *up_m), level_deg=2 * level.deviation_deg)
+
+
+def _levelled_note(fit: SurveyedFit, level: Level) -> str:
+    by = "points with heights" if fit.known.any() else "GPS" if level.gps is not None else "nothing"
+    return f"too few control points have heights to level or to bend the model: heights are by {by}."
+
+
+def _accuracy_as_left(
+    accuracy: AccuracyFacts, model: pycolmap.Reconstruction, gcps: GcpList, kept: Sequence[int], targets: np.ndarray
+) -> AccuracyFacts:
+    """No better than what a finished model leaves of the points that it kept, and with the error of their datum."""
     seen = [(k, now) for k in kept if (now := triangulate(model, gcps.points[k])) is not None]
     accuracy = no_better_than_left(accuracy, np.array([now.position - targets[k] for k, now in seen]).reshape(-1, 3))
-    if accuracy.place_m:
-        with_datum = float(np.hypot(accuracy.place_m[0], gcps.datum_error_m))
-        accuracy = replace(accuracy, place_m=(with_datum, *accuracy.place_m[1:]))
-    doubtful = frozenset(gcps.points[k].name for k in (*rows[~trusted].tolist(), *wrong))
-    return Surveyed(model, f"{len(kept)} control points ({gcps.source}, {gcps.crs})", doubtful, accuracy, notes)
+    if not accuracy.place_m:
+        return accuracy
+    with_datum = float(np.hypot(accuracy.place_m[0], gcps.datum_error_m))
+    return replace(accuracy, place_m=(with_datum, *accuracy.place_m[1:]))
 
 
 def fit_surveyed(
@@ -257,14 +287,12 @@ def _check_enough(targets: Float[np.ndarray, "n 3"], num_wrong: int, source: str
         )
 
 
-def _depth_beside_surface(
-    model: pycolmap.Reconstruction, gcps: GcpList, used: Sequence[tuple[int, TriangulatedPoint]]
-) -> float:
+def _depth_beside_surface(model: pycolmap.Reconstruction, used: Iterable[TriangulatedPoint]) -> float:
     """How many times as far from the cameras points are as what is seen nearest to their marks, the median: marks of
     photographs of another size meet too, elsewhere. 1 where the photographs show too little there."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     ratios = []
-    for _, seen in used:
+    for seen in used:
         for each in seen.agreeing:
             view = images[each.image]
             shown = [point for point in view.points2D if point.has_point3D()]
