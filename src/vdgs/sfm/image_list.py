@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
@@ -89,38 +90,68 @@ def collect_images(
     """
     folders = list(dict.fromkeys(folders))
     for folder in folders:
-        if not folder.is_dir() and not is_capture(folder):
-            check_no_foreign_file(folder)
-            if is_archive(folder):
-                raise CaptureError(f"{folder}: is an archive. Unpack it, and give the folder of the photographs.")
-            what = "is a file, and no film" if folder.is_file() else "no such folder or film"
-            raise CaptureError(f"{folder}: {what}. Give the folder that the photographs are in.")
-        check_no_run(folder)
-        if is_reconstruction(folder) and not is_capture(folder):
-            raise CaptureError(
-                f"{folder}: is a capture that is not finished. Give its photographs and --output {shell_word(folder)}"
-            )
-        if is_capture(folder):
-            raise CaptureError(
-                f"{folder}: is a capture already. Use it as it is: vdgs run {shell_word(folder)} --output RUN\n"
-                f"{HOW_TO_MAKE_NEW_POSES}"
-            )
-        below = model_below(folder)
-        if below:
-            raise CaptureError(
-                f"{below}\nTo make new poses of photographs instead, give their own folder, without a model below it."
-            )
+        _check_folder(folder)
     found = find_files(folders)
     if not found.named:
         raise nothing_found(folders, found)
     check_decoders(folders, found)
-    masks, notes = find_masks(folders, found.named.values())
+    masks, mask_notes = find_masks(folders, found.named.values())
     named = {name: path for name, path in found.named.items() if path in masks}
     with ThreadPoolExecutor(4) as pool:
         read = list(pool.map(partial(_read, cache(list_folder)), named.values(), named.keys(), masks.values()))
-    photographs = [each for each in read if isinstance(each, ImageMetadata)]
+    chosen = _chosen([each for each in read if isinstance(each, ImageMetadata)], camera_model, brackets)
     left_out = [ExcludedImage(name, why) for name, why in found.left_out.items()]
     left_out += [each for each in read if isinstance(each, ExcludedImage)]
+    left_out = [replace(each, file=found.renamed.get(each.name)) for each in (*left_out, *chosen.left_out)]
+    notes = [
+        *found.notes(),
+        *mask_notes,
+        *chosen.notes,
+        *_kind_notes(chosen.photographs),
+        *_split_notes(chosen.photographs),
+        *_undecodable(chosen.photographs),
+    ]
+    notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
+    if len(chosen.photographs) < MIN_IMAGES:
+        dangling = found.dangling_links()
+        raise _too_few(folders, len(chosen.photographs), [each.line for each in left_out] + [dangling] * bool(dangling))
+    return ImageList(tuple(folders), tuple(chosen.photographs), tuple(left_out), found.others, tuple(notes))
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise CaptureError for a path that is no folder or film, and for what is made of photographs."""
+    if not folder.is_dir() and not is_capture(folder):
+        check_no_foreign_file(folder)
+        if is_archive(folder):
+            raise CaptureError(f"{folder}: is an archive. Unpack it, and give the folder of the photographs.")
+        what = "is a file, and no film" if folder.is_file() else "no such folder or film"
+        raise CaptureError(f"{folder}: {what}. Give the folder that the photographs are in.")
+    check_no_run(folder)
+    if is_capture(folder):
+        raise CaptureError(
+            f"{folder}: is a capture already. Use it as it is: vdgs run {shell_word(folder)} --output RUN\n"
+            f"{HOW_TO_MAKE_NEW_POSES}"
+        )
+    if is_reconstruction(folder):
+        raise CaptureError(
+            f"{folder}: is a capture that is not finished. Give its photographs and --output {shell_word(folder)}"
+        )
+    below = model_below(folder)
+    if below:
+        raise CaptureError(
+            f"{below}\nTo make new poses of photographs instead, give their own folder, without a model below it."
+        )
+
+
+class _Chosen(NamedTuple):
+    """What is used of photographs that can be read, what not, and what people should know of both."""
+
+    photographs: list[ImageMetadata]
+    left_out: list[ExcludedImage]
+    notes: list[str]
+
+
+def _chosen(photographs: list[ImageMetadata], camera_model: CameraModel, brackets: Brackets) -> _Chosen:
     photographs, doubled = _drop_duplicates(photographs)
     unused, spectral = unused_bands(photographs)
     photographs, strange = _of_the_flight([photo for photo in photographs if photo.name not in unused])
@@ -128,29 +159,16 @@ def collect_images(
     unused |= exposures
     photographs, lone = _with_models([photo for photo in photographs if photo.name not in exposures], camera_model)
     photographs, rigs = with_sensors(photographs)
-    left_out += [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
-    left_out = [replace(each, file=found.renamed.get(each.name)) for each in left_out]
-    notes = [
-        *found.notes(),
-        *notes,
-        *spectral,
-        *bracketed,
-        *rigs,
-        *_kind_notes(photographs),
-        *_split_notes(photographs),
-    ]
-    notes += _undecodable(photographs)
-    notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
-    if len(photographs) < MIN_IMAGES:
-        said = [each.line for each in left_out]
-        said += [dangling] if (dangling := found.dangling_links()) else []
-        reasons = format_list(said)
-        raise CaptureError(
-            f"{', '.join(map(str, folders))}: {len(photographs)} photograph{'s' if len(photographs) != 1 else ''} that "
-            f"can be used; a scene needs {MIN_IMAGES} at the very least, and each place two or three that show "
-            f"it from different positions.{reasons}"
-        )
-    return ImageList(tuple(folders), tuple(photographs), tuple(left_out), found.others, tuple(notes))
+    left_out = [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
+    return _Chosen(photographs, left_out, [*spectral, *bracketed, *rigs])
+
+
+def _too_few(folders: Sequence[Path], count: int, left_out: Sequence[str]) -> CaptureError:
+    return CaptureError(
+        f"{', '.join(map(str, folders))}: {count} photograph{'s' if count != 1 else ''} that "
+        f"can be used; a scene needs {MIN_IMAGES} at the very least, and each place two or three that show "
+        f"it from different positions.{format_list(left_out)}"
+    )
 
 
 def is_image_folder(folder: Path) -> bool:
