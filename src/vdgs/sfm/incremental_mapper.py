@@ -64,32 +64,52 @@ def should_fix_focal(
     photographs = [photo for photo in photographs if not photo.face]
     if not photographs:
         return True, "views that are cut out of panoramas have none to fit"
+    bent = any(photo.camera_model == FISHEYE for photo in photographs)  # of many terms: one may stand for a height
+    told = _by_lenses(photographs) or _by_flight(photographs, bent)
+    if told:
+        return told
+    if all(photo.lens is not None and photo.lens.source == CALIBRATED_SOURCE for photo in photographs):
+        return True, "calibrated by the maker"
+    return _by_positions(positions, bent) or (False, "nothing says that it was flown level, looking straight down")
+
+
+def _by_lenses(photographs: Sequence[ImageMetadata]) -> tuple[bool, str] | None:
+    """What tags of lenses say of holding the focal length, and why; None where they leave it open."""
     few = max(1, FEW * len(photographs))
     if sum(photo.lens is None for photo in photographs) > few:
         return False, "nothing says it for some photographs"
     if sum(bool(photo.lens and photo.lens.doubt) for photo in photographs) > few:
         return False, "what the photographs say of it contradicts itself"
-    tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    if tilts and np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG) >= MIN_OBLIQUE_SHARE:
-        return False, f"{np.mean(np.array(tilts) > OBLIQUE_ANGLE_DEG):.0%} oblique views tell it"
+    return None
+
+
+def _by_flight(photographs: Sequence[ImageMetadata], bent: bool) -> tuple[bool, str] | None:
+    """The same by recorded attitudes, and by heights over the take-off unless lenses are `bent`."""
+    tilts = np.array([photo.attitude.tilt_deg for photo in photographs if photo.attitude])
+    oblique = np.mean(tilts > OBLIQUE_ANGLE_DEG) if len(tilts) else 0.0
+    if oblique >= MIN_OBLIQUE_SHARE:
+        return False, f"{oblique:.0%} oblique views tell it"
     known = [photo for photo in photographs if photo.relative_altitude is not None]
     heights, flights = np.array([photo.relative_altitude for photo in known], float), flights_of(known)
-    bent = any(photo.camera_model == FISHEYE for photo in photographs)  # of many terms: one may stand for a height
-    if not bent and len(heights) >= 3 and _range(heights) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
-        if _range(heights - _of_flights(heights, flights)) > MIN_HEIGHT_SPREAD * abs(np.median(heights)):
-            return False, "flown at several heights, which tell it"
-        return True, OF_FLIGHTS
+    if not bent and len(heights) >= 3:
+        steady = MIN_HEIGHT_SPREAD * abs(np.median(heights))
+        if _range(heights) > steady:
+            several = _range(heights - _of_flights(heights, flights)) > steady
+            return (False, "flown at several heights, which tell it") if several else (True, OF_FLIGHTS)
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
-    if all(photo.lens is not None and photo.lens.source == CALIBRATED_SOURCE for photo in photographs):
-        return True, "calibrated by the maker"
+    return None
+
+
+def _by_positions(positions: GpsPriors, bent: bool) -> tuple[bool, str] | None:
+    """The same by where photographs were taken; unless lenses are `bent`, whatever altitudes of flights differ by."""
     if _is_survey_grid(positions):
         return True, "level strips over an area: the flight cannot tell it, if it looked straight down"
-    if not bent and positions.usable and len(positions.flights) == len(positions):
-        level = positions.enu - _of_flights(positions.enu[:, 2], positions.flights)[:, None] * [0, 0, 1]
-        if _is_survey_grid(replace(positions, enu=level), ERRORS_RANGE * float(np.median(positions.gps_std[:, 2]))):
-            return True, OF_FLIGHTS
-    return False, "nothing says that it was flown level, looking straight down"
+    if bent or not positions.usable or len(positions.flights) != len(positions):
+        return None
+    level = positions.enu - _of_flights(positions.enu[:, 2], positions.flights)[:, None] * [0, 0, 1]
+    errors = ERRORS_RANGE * float(np.median(positions.gps_std[:, 2]))
+    return (True, OF_FLIGHTS) if _is_survey_grid(replace(positions, enu=level), errors) else None
 
 
 def _of_flights(heights: np.ndarray, flights: np.ndarray) -> np.ndarray:
