@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from vdgs.captures.angles import LIMITS, SIDES, degrees_of_parts, degrees_of_text, side_of
@@ -69,29 +69,37 @@ def read_place(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Place | 
     in_xmp = _place_in_xmp(xmp)
     if gps.get(2) is None and gps.get(4) is None:
         return in_xmp, ""
-    found = {axis: _angle(gps, axis) for axis in _TAGS}
-    unclear = [axis for axis, angle in found.items() if angle is None]
-    if unclear:
-        shown = ", ".join(f"{axis} {_shown(gps.get(_TAGS[axis][1]))}" for axis in unclear)
-        return in_xmp, "" if in_xmp else f"the position in EXIF is not understood ({shown})"
-    latitude, longitude = (angle for angle in found.values() if angle is not None)
-    if in_xmp is not None and _same((abs(latitude[0]), abs(longitude[0])), (abs(in_xmp[0]), abs(in_xmp[1]))):
-        if latitude[1] and longitude[1] and not _same((latitude[0], longitude[0]), in_xmp):
-            return None, f"EXIF and XMP name different hemispheres ({_degrees(latitude, longitude)}, {_pair(in_xmp)})"
-        exact = latitude[1] and longitude[1] and not _whole_seconds(latitude[0], longitude[0])
-        return ((latitude[0], longitude[0]) if exact else in_xmp), ""
-    if latitude[0] == longitude[0] == 0:
+    angles = {axis: angle for axis in _TAGS if (angle := _angle(gps, axis)) is not None}
+    if len(angles) < len(_TAGS):
+        return in_xmp, "" if in_xmp else _not_understood(gps, angles)
+    place = angles["latitude"][0], angles["longitude"][0]
+    sideless = [axis for axis, (_, is_sided) in angles.items() if not is_sided]
+    if in_xmp is not None and _same(_without_sides(place), _without_sides(in_xmp)):
+        return _of_both(place, in_xmp, not sideless)
+    if not any(place):
         return in_xmp or (0.0, 0.0), ""
-    if not (latitude[1] and longitude[1]):
-        sides = [f"{axis} {south} or {north}" for axis, (south, north) in SIDES.items() if not found[axis][1]]  # type: ignore[index]
-        return None, (
-            f"the position in EXIF ({_degrees(latitude, longitude)}) names no hemisphere ({', '.join(sides)}): say it "
-            "in a table (--gps)"
-        )
-    place = latitude[0], longitude[0]
-    if in_xmp is not None and not _same(place, in_xmp):
+    if sideless:
+        return None, _without_hemisphere(place, sideless)
+    if in_xmp is not None:
         return None, f"EXIF and XMP name different places ({_pair(place)}; {_pair(in_xmp)})"
     return place, ""
+
+
+def _of_both(place: Place, in_xmp: Place, is_sided: bool) -> tuple[Place | None, str]:
+    """The better of two places that are one but for their sides of the Earth, which EXIF may not say (`is_sided`)."""
+    if is_sided and not _same(place, in_xmp):
+        return None, f"EXIF and XMP name different hemispheres ({_pair(place)}, {_pair(in_xmp)})"
+    return (place if is_sided and not _whole_seconds(*place) else in_xmp), ""
+
+
+def _not_understood(gps: Mapping[int, Any], understood: Collection[str]) -> str:
+    shown = ", ".join(f"{axis} {_shown(gps.get(tag))}" for axis, (_, tag) in _TAGS.items() if axis not in understood)
+    return f"the position in EXIF is not understood ({shown})"
+
+
+def _without_hemisphere(place: Place, sideless: Collection[str]) -> str:
+    sides = [f"{axis} {south} or {north}" for axis, (south, north) in SIDES.items() if axis in sideless]
+    return f"the position in EXIF ({_pair(place)}) names no hemisphere ({', '.join(sides)}): say it in a table (--gps)"
 
 
 def read_fix(gps: Mapping[int, Any]) -> str:
@@ -226,8 +234,8 @@ def _same(one: Place, other: Place) -> bool:
     return all(abs(a - b) < SAME_PLACE_DEG for a, b in zip(one, other, strict=True))
 
 
-def _degrees(latitude: tuple[float, bool], longitude: tuple[float, bool]) -> str:
-    return _pair((latitude[0], longitude[0]))
+def _without_sides(place: Place) -> Place:
+    return abs(place[0]), abs(place[1])
 
 
 def _pair(place: Place) -> str:
