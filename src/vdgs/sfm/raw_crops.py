@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from vdgs.sfm.xmp import first_number, text
 
@@ -33,28 +34,57 @@ def read_raw_crop(xmp: Mapping[str, str], width: int, height: int, whole: float 
     XMP also keeps crops that nobody applied (in raw files, and in JPEGs that were only developed): of these the pixels
     are whole. Sizes tell it, then the shape, then what the program says (crs:AlreadyApplied).
     """
-    edges = [first_number(xmp, f"crs:Crop{side}") for side in ("Left", "Right", "Top", "Bottom")]
-    left, right, top, bottom = (edge or 0.0 for edge in edges)
-    if text(xmp, "crs:HasCrop").lower() != "true" or None in edges:
-        return None, ""
-    across, down = right - left, bottom - top
-    if not (0 < across <= 1 and 0 < down <= 1) or across * down == 1:
+    edges = _edges(xmp)
+    if edges is None:
         return None, ""
     said = text(xmp, "crs:AlreadyApplied").lower() == "true"
     longer, aspect = max(width, height), max(width, height) / min(width, height)
-    found = _explained(across, down, math.radians(first_number(xmp, "crs:CropAngle") or 0.0), aspect)
+    angle = math.radians(first_number(xmp, "crs:CropAngle") or 0.0)
+    found = _explained(edges.across, edges.down, angle, aspect)
     if whole and _alike(longer, whole) and (found is None or not _alike(found.part, 1.0)):
         return None, ""
-    if found is not None:
-        cut = whole is not None and _alike(longer, found.part * whole)
-        odd = not any(_alike(aspect, shape) for shape in USUAL_SHAPES)
-        off = math.hypot((left + right) / 2 - 0.5, ((top + bottom) / 2 - 0.5) / found.shape)
-        return (replace(found, beside=off / found.part) if cut or odd or said else None), ""
-    return None, (
-        f"cropped by a program, but not as XMP says (crs:HasCrop: {across:.0%} of the width, {down:.0%} of the height "
-        f"give no {width} x {height} px of a usual shape); the focal length may be that of the whole"
-        if said
-        else ""
+    if found is None:
+        return None, _unexplained(edges, width, height) if said else ""
+    cut = whole is not None and _alike(longer, found.part * whole)
+    odd = not any(_alike(aspect, shape) for shape in USUAL_SHAPES)
+    return (replace(found, beside=edges.off_middle(found.shape) / found.part) if cut or odd or said else None), ""
+
+
+class _Edges(NamedTuple):
+    """Edges of a crop as shares of the sides of the whole."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    @property
+    def across(self) -> float:
+        return self.right - self.left
+
+    @property
+    def down(self) -> float:
+        return self.bottom - self.top
+
+    def off_middle(self, shape: float) -> float:
+        """How far the middle is from that of a whole of some shape, over its longer side."""
+        return math.hypot((self.left + self.right) / 2 - 0.5, ((self.top + self.bottom) / 2 - 0.5) / shape)
+
+
+def _edges(xmp: Mapping[str, str]) -> _Edges | None:
+    """The crop that XMP says; None where it says none, or one of all or of nothing."""
+    found = [first_number(xmp, f"crs:Crop{side}") for side in ("Left", "Right", "Top", "Bottom")]
+    if text(xmp, "crs:HasCrop").lower() != "true" or None in found:
+        return None
+    edges = _Edges(*(edge or 0.0 for edge in found))
+    is_part = 0 < edges.across <= 1 and 0 < edges.down <= 1 and edges.across * edges.down != 1
+    return edges if is_part else None
+
+
+def _unexplained(edges: _Edges, width: int, height: int) -> str:
+    return (
+        f"cropped by a program, but not as XMP says (crs:HasCrop: {edges.across:.0%} of the width, {edges.down:.0%} of "
+        f"the height give no {width} x {height} px of a usual shape); the focal length may be that of the whole"
     )
 
 
