@@ -45,27 +45,38 @@ def plain_number(word: str, flag: str, hint: Any) -> str:
         return word
     whole = float not in kinds
     word = word.replace("\u2212", "-")
-    plain = re.sub(r"[, ']", "", word) if whole and _THOUSANDS.fullmatch(word) else word
-    comma = _DECIMAL_COMMA.fullmatch(word)
-    if not whole and comma and (len(comma[2]) != 3 or comma[1].strip("+-") == "0"):
-        plain = f"{comma[1]}.{comma[2]}"
-    factor = 1.0
-    if found := _WITH_UNIT.fullmatch(plain):
-        unit = found[2].lower()
-        factors = _UNITS.get(re.split(r"[.-]", flag)[-1], _THOUSAND if whole else {})
-        factors = {**factors, "%": 0.01} if _is_share(hint) else factors
-        if unit not in factors:
-            return word
-        plain, factor = found[1], factors[unit]
+    plain, factor = _parted(_without_separators(word, whole), flag, hint, whole)
     if re.fullmatch(_NUMBER, plain, re.IGNORECASE) is None or (not whole and factor == 1 and plain == word):
-        return plain if factor == 1 else word
+        return plain
     if factor == 1 and re.fullmatch(r"[+-]?[\d_]+", plain):
         return plain  # with all its digits
     value = float(plain) * factor
-    decimals = re.fullmatch(r"[+-]?\d+\.\d{3}", plain) is not None  # 30.000 is thirty thousand to many
     if not whole:
         return repr(float(f"{value:.15g}"))
+    decimals = re.fullmatch(r"[+-]?\d+\.\d{3}", plain) is not None  # 30.000 is thirty thousand to many
     return str(int(value)) if value.is_integer() and not decimals and abs(value) < 2**63 else word
+
+
+def _without_separators(word: str, whole: bool) -> str:
+    """A number without signs between thousands, where it is `whole`, and else with a point for a decimal comma."""
+    if whole:
+        return re.sub(r"[, ']", "", word) if _THOUSANDS.fullmatch(word) else word
+    comma = _DECIMAL_COMMA.fullmatch(word)
+    if comma and (len(comma[2]) != 3 or comma[1].strip("+-") == "0"):
+        return f"{comma[1]}.{comma[2]}"
+    return word
+
+
+def _parted(word: str, flag: str, hint: Any, whole: bool) -> tuple[str, float]:
+    """A number without its unit, and the factor to what the option counts in; all of a word whose unit is none of an
+    option's, which is no number."""
+    found = _WITH_UNIT.fullmatch(word)
+    if not found:
+        return word, 1.0
+    factors = _UNITS.get(re.split(r"[.-]", flag)[-1], _THOUSAND if whole else {})
+    factors = {**factors, "%": 0.01} if _is_share(hint) else factors
+    unit = found[2].lower()
+    return (found[1], factors[unit]) if unit in factors else (word, 1.0)
 
 
 def how_to_write(words: str, flag: str, hint: Any) -> str:
