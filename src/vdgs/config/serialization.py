@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -116,27 +116,44 @@ def _read_words(hint: Any, value: Any, where: str) -> Any:
 
 def read_value(hint: Any, value: Any, where: str, numeric_text: bool = True) -> Any:
     """A plain value as what its type says. Raises ValueError for one that is of no such type."""
-    kind, inner = without_notes(hint), typing.get_args(without_notes(hint))
-    origin = typing.get_origin(kind)
+    kind = without_notes(hint)
     if getattr(value, "shape", None) == ():  # a number of numpy or torch
         value = value.item()
-    read = partial(read_value, numeric_text=numeric_text)
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, Mapping):
             raise ValueError(f"{where} is {value!r}, not a group of settings")
         return from_dict(typing.cast(type, kind), value, where, numeric_text=numeric_text)
+    try:
+        if typing.get_origin(kind) is None:
+            return _read_plain(kind, value, numeric_text)
+        return _read_parts(kind, value, partial(read_value, where=where, numeric_text=numeric_text))
+    except _OtherType:
+        raise ValueError(f"{where} is {value!r}; it must be {describe_type(hint)}") from None
+
+
+class _OtherType(Exception):
+    """A value is of none of the types that it may be of."""
+
+
+def _read_parts(kind: Any, value: Any, read: Callable[[Any, Any], Any]) -> Any:
+    """A value of a tuple, of one of several types or words; `read` reads one of a type inside."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple and isinstance(value, (list, tuple)):
         kinds = [inner[0]] * len(value) if inner[-1:] == (Ellipsis,) else inner
         if len(kinds) == len(value):
-            return tuple(read(each, item, where) for each, item in zip(kinds, value, strict=True))
+            return tuple(read(each, item) for each, item in zip(kinds, value, strict=True))
     if origin in (typing.Union, UnionType):
         for each in inner:
             with suppress(ValueError):
-                return read(each, value, where)
+                return read(each, value)
     if origin is typing.Literal:
         word = ("off", "on")[value] if isinstance(value, bool) else value  # which YAML makes of these words
         if word in inner:
             return word
+    raise _OtherType
+
+
+def _read_plain(kind: Any, value: Any, numeric_text: bool) -> Any:
     if kind is Path and isinstance(value, (str, Path)):
         return Path(value)
     if kind is float and isinstance(value, str) and numeric_text:  # YAML takes 1e-4 for text: it wants 1.0e-4
@@ -148,7 +165,7 @@ def read_value(hint: Any, value: Any, where: str, numeric_text: bool = True) -> 
     plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
     if plain and (kind is bool or not isinstance(value, bool)):
         return value
-    raise ValueError(f"{where} is {value!r}; it must be {describe_type(hint)}")
+    raise _OtherType
 
 
 def _whole(number: float) -> int:
