@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -116,6 +116,10 @@ class _Line:
     name: str
 
 
+#: A line, and its mark; None in a photograph that was left out.
+_Marked = tuple[_Line, GcpObservation | None]
+
+
 def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]) -> GcpList:
     """The points of a gcp_list.txt: a first line with the coordinate system, then x y z px py photograph [name].
 
@@ -125,40 +129,65 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
+    header, lines, transform, system = _listed(file)
+    by_name = photographs_by_name(collection)
+    lines, strange = _of_photographs(lines, by_name, file)
+    found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
+    groups = _by_point(found)
+    held_out = _held_out(check_points, [name for name, _ in groups], file)
+    # Of all points at once first: the operation to WGS 84 is that of their middle.
+    transform(np.nan_to_num([group[0][0].place for _, group in groups]))
+    points = []
+    for name, group in groups:
+        geodetic = _geodetic([line for line, _ in group], name, transform, system, file)
+        _check_one_mark(group, name, file)
+        seen = tuple(sighting for _, sighting in group if sighting is not None)
+        is_check_point = ALL_POINTS in held_out or name in held_out or name.startswith(CHECK_PREFIX)
+        points.append(GroundControlPoint(name, geodetic, seen, is_check_point))
+    strange += [f"{file.name}: {said}" for said in _said_of_points(points, lines)]
+    error_m, converted = datum_error(header, np.array([point.geodetic for point in points]))
+    strange += [f"{file.name}: points are {converted}."] if converted else []
+    return replace(_checked(points, system, file, strange), datum_error_m=error_m)
+
+
+class _Listed(NamedTuple):
+    """What a file has, places in the units of its system."""
+
+    header: str
+    lines: list[_Line]
+    transform: Any
+    """From the system to WGS 84."""
+    system: str
+
+
+def _listed(file: Path) -> _Listed:
     header, rows, (across, along, up) = _rows(file)
     transform, system = to_geodetic(header, file)
     system = system if up in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
     height = 1.0 if up is None else up / height_unit(header)
     units = in_units_of(header, across, file), in_units_of(header, along, file), height
-    lines = [_line(row, file, units) for row in rows]
-    by_name = photographs_by_name(collection)
-    lines, strange = _of_photographs(lines, by_name, file)
-    found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
-    groups: dict[tuple[object, ...], list[tuple[_Line, GcpObservation | None]]] = {}
+    return _Listed(header, [_line(row, file, units) for row in rows], transform, system)
+
+
+def _by_point(found: Sequence[_Marked]) -> list[tuple[str, list[_Marked]]]:
+    """Names of points, and the lines of each: those of one name or, without names, of one place."""
+    groups: dict[tuple[object, ...], list[_Marked]] = {}
     for line, sighting in found:
         groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
-    names = [group[0][0].name or f"point {k}" for k, group in enumerate(groups.values(), 1)]
-    check_points = _held_out(check_points, names, file)
-    # Of all points at once first: the operation to WGS 84 is that of their middle.
-    transform(np.nan_to_num([group[0][0].place for group in groups.values()]))
-    points = []
-    for name, group in zip(names, groups.values(), strict=True):
-        geodetic = _geodetic([line for line, _ in group], name, transform, system, file)
-        _check_one_mark(group, name, file)
-        seen = tuple(sighting for _, sighting in group if sighting is not None)
-        held_out = ALL_POINTS in check_points or name in check_points or name.startswith(CHECK_PREFIX)
-        points.append(GroundControlPoint(name, geodetic, seen, held_out))
+    return [(group[0][0].name or f"point {k}", group) for k, group in enumerate(groups.values(), 1)]
+
+
+def _said_of_points(points: Sequence[GroundControlPoint], lines: Sequence[_Line]) -> list[str]:
+    """What people should know of points that have no height, or 0, and of those that names hold out."""
+    said = []
     flat = [point.name for point in points if math.isnan(point.geodetic[2])]
     if flat:
-        strange = [*strange, f"{file.name}: points without a height ({first_names(flat)}): used in the plane."]
+        said.append(f"points without a height ({first_names(flat)}): used in the plane.")
     if len(points) >= MIN_CONTROL_POINTS and not any(line.place[2] for line in lines):
-        said = "all heights are exactly 0 and are used as they are. Where they are not known, write nan."
-        strange = [*strange, f"{file.name}: {said}"]
-    if any(name.startswith(CHECK_PREFIX) for name in names):
-        strange = [*strange, f"{file.name}: points named {CHECK_PREFIX}... are held out as check points, as in ODM."]
-    error_m, converted = datum_error(header, np.array([point.geodetic for point in points]))
-    strange = [*strange, f"{file.name}: points are {converted}."] if converted else strange
-    return replace(_checked(points, system, file, strange), datum_error_m=error_m)
+        said.append("all heights are exactly 0 and are used as they are. Where they are not known, write nan.")
+    if any(point.name.startswith(CHECK_PREFIX) for point in points):
+        said.append(f"points named {CHECK_PREFIX}... are held out as check points, as in ODM.")
+    return said
 
 
 def _of_photographs(
@@ -369,7 +398,7 @@ def _held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> list
     return found
 
 
-def _check_one_mark(group: Sequence[tuple[_Line, GcpObservation | None]], name: str, file: Path) -> None:
+def _check_one_mark(group: Sequence[_Marked], name: str, file: Path) -> None:
     """Raise CaptureError where a photograph shows a point at two places."""
     marked: dict[str, _Line] = {}
     for line, sighting in group:

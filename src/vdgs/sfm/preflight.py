@@ -6,7 +6,7 @@ import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 
 import numpy as np
 from shapely import MultiPoint
@@ -66,27 +66,23 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     photographs = collection.images
     height, height_from = flying_height(photographs)
     footprint = _footprint(photographs, height)
-    spread = np.ptp(positions.enu[:, :2], axis=0) if len(positions) else None
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    days = sorted(
-        {f"{when:%Y-%m-%d}" for when in (time_of(photo.datetime) for photo in photographs) if when is not None}
-    )
+    days = sorted({f"{when:%Y-%m-%d}" for when in _moments(photographs)})
     accuracies = [max(photo.gps_std[:2]) for photo in photographs if photo.gps_std is not None]
     overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
-    focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return PreflightReport(
         num_images=len(photographs),
         num_masks=sum(photo.mask is not None for photo in photographs),
         transparent=sum(photo.has_alpha_channel for photo in photographs),
         cameras=Counter(photo.camera for photo in photographs).most_common(),
-        sizes=[(*size, n) for size, n in Counter((p.width, p.height) for p in photographs).most_common()],
+        sizes=[(*size, n) for size, n in Counter((photo.width, photo.height) for photo in photographs).most_common()],
         positions=len(positions),
-        spread_m=None if spread is None else (float(spread[0]), float(spread[1])),
+        spread_m=_spread(positions),
         altitude_reference=positions.altitude_reference,
         accurate=len(accuracies),
         rtk=bool(accuracies) and max(accuracies) < RTK_M,
         height_m=height, height_from=height_from,
-        gsd_m=height / focal if height and focal else None,
+        gsd_m=_ground_sampling(photographs, height),
         forward_overlap=overlap, views_per_point=views,
         oblique=sum(tilt > OBLIQUE_ANGLE_DEG for tilt in tilts) if tilts else None,
         days=days,
@@ -102,6 +98,20 @@ def flying_height(photographs: Sequence[ImageMetadata]) -> tuple[float | None, s
     if 2 * len(heights) < len(photographs):
         return None, "the photographs do not say it"
     return statistics.median(heights), "above the take-off, by XMP"
+
+
+def _spread(positions: GpsPriors) -> tuple[float, float] | None:
+    """How far positions reach east and north in metres."""
+    if not len(positions):
+        return None
+    east, north = np.ptp(positions.enu[:, :2], axis=0)
+    return float(east), float(north)
+
+
+def _ground_sampling(photographs: Sequence[ImageMetadata], height: float | None) -> float | None:
+    """Metres of level ground that a pixel shows in a view straight down."""
+    focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
+    return height / focal if height and focal else None
 
 
 def _median(values: object) -> float | None:
@@ -135,39 +145,54 @@ def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None
 
 
 def _warnings(collection: ImageList, overlap: float | None, views: float | None, days: Sequence[str]) -> list[str]:
-    photographs, found = collection.images, list[str]()
-    without = [photo.name for photo in photographs if photo.lens is None and not photo.is_panorama]
-    if without:
-        found.append(f"{first_names(without)}: nothing says the focal length; it is fitted from a guess.")
-    found += _doubts(photographs)
-    around = [photo.name for photo in photographs if photo.is_panorama]
-    if around:
-        found.append(
-            f"{first_names(around)}: panoramas of 360°; each is cut into six views of 90° that move as one "
-            "(pano_front/NAME, pano_right/NAME, ...)."
-        )
-    round_ = [photo.name for photo in photographs if photo.width == 2 * photo.height and photo.name in without]
-    if round_:
-        found.append(
-            f"{first_names(round_)}: exactly twice as wide as high, of an unknown lens. If these are panoramas of "
-            "360°: --camera-model equirectangular"
-        )
-    endless = [photo.name for photo in photographs if not photo.whole]
-    if endless:
-        found.append(f"{first_names(endless)}: the file lacks its end marker, but nothing of the picture; used.")
-    small = _small_files(photographs)
-    if small:
-        found.append(f"{first_names(small)}: far smaller files than the others: blurred, dark, or showing little?")
+    photographs = collection.images
+    found = [*_of_lenses(photographs), *_of_files(photographs)]
     if overlap is not None and overlap < MIN_OVERLAP:
         found.append(f"they overlap by about {overlap:.0%} along the flight; below {MIN_OVERLAP:.0%} gaps come.")
     if views is not None and views < MIN_VIEWS_PER_POINT:
         found.append(
             f"a place is seen by about {views:.1f} photographs; from {MIN_VIEWS_PER_POINT:g} on scenes become good."
         )
-    moments = [when for when in (time_of(photo.datetime) for photo in photographs) if when is not None]
+    moments = _moments(photographs)
     if moments and max(moments) - min(moments) > timedelta(days=1):
         found.append(f"taken on {len(days)} days, {days[0]} to {days[-1]}: light, shadows and plants may differ.")
     return found
+
+
+def _moments(photographs: Sequence[ImageMetadata]) -> list[datetime]:
+    return [when for when in (time_of(photo.datetime) for photo in photographs) if when is not None]
+
+
+def _of_lenses(photographs: Sequence[ImageMetadata]) -> list[str]:
+    """What to say of lenses that are unknown, doubted, or of panoramas."""
+    unknown = [photo for photo in photographs if photo.lens is None and not photo.is_panorama]
+    return [
+        *_said_of(unknown, "nothing says the focal length; it is fitted from a guess."),
+        *_doubts(photographs),
+        *_said_of(
+            [photo for photo in photographs if photo.is_panorama],
+            "panoramas of 360°; each is cut into six views of 90° that move as one (pano_front/NAME, "
+            "pano_right/NAME, ...).",
+        ),
+        *_said_of(
+            [photo for photo in unknown if photo.width == 2 * photo.height],
+            "exactly twice as wide as high, of an unknown lens. If these are panoramas of 360°: --camera-model "
+            "equirectangular",
+        ),
+    ]
+
+
+def _of_files(photographs: Sequence[ImageMetadata]) -> list[str]:
+    """What to say of files that were cut off, or may show little."""
+    endless = [photo for photo in photographs if not photo.whole]
+    return [
+        *_said_of(endless, "the file lacks its end marker, but nothing of the picture; used."),
+        *_said_of(_small_files(photographs), "far smaller files than the others: blurred, dark, or showing little?"),
+    ]
+
+
+def _said_of(photographs: Sequence[ImageMetadata], text: str) -> list[str]:
+    return [f"{first_names([photo.name for photo in photographs])}: {text}"] if photographs else []
 
 
 def _doubts(photographs: Sequence[ImageMetadata]) -> list[str]:
@@ -181,15 +206,12 @@ def _doubts(photographs: Sequence[ImageMetadata]) -> list[str]:
     return [f"{first_names(names[kind])}: {text.rstrip('.')}." for kind, text in texts.items()]
 
 
-def _small_files(photographs: Sequence[ImageMetadata]) -> list[str]:
-    """Names of those with far fewer bytes than others of their camera and size."""
+def _small_files(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
+    """Those with far fewer bytes than others of their camera and size."""
     kinds: dict[tuple[str, int, str], list[ImageMetadata]] = {}
     for photo in photographs:
         kinds.setdefault((photo.camera, photo.width * photo.height, photo.path.suffix.lower()), []).append(photo)
     medians = {kind: statistics.median(photo.file_bytes for photo in alike) for kind, alike in kinds.items()}
     return [
-        photo.name
-        for kind, alike in kinds.items()
-        for photo in alike
-        if photo.file_bytes < SMALL_FILE_RATIO * medians[kind]
+        photo for kind, alike in kinds.items() for photo in alike if photo.file_bytes < SMALL_FILE_RATIO * medians[kind]
     ]
