@@ -50,11 +50,7 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
 
     None for what is no such angle. A comma stands for the decimal point where it is the only one of its text.
     """
-    plain = _UNITS.sub(" ", unicodedata.normalize("NFKC", text.replace("\u00ba", " "))).strip()
-    plain = _LOST_SIGN.sub(" ", plain)
-    for signs, side_letter in _SIDES_BY_SIGN.items():
-        plain = re.sub(signs, side_letter, plain)
-    plain = re.sub("(?<=\\d)[度分秒]", " ", plain)
+    plain = _without_units(text)
     if any(sign.isalpha() and not sign.isascii() for sign in plain):  # of a script that is not read
         return None
     letters = re.findall(r"[A-Za-z]+", re.sub(r"\d[eE][+-]?\d", "00", plain))
@@ -63,19 +59,38 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     side = side_of(letters[0], axis) if letters else None
     if letters and side is None:
         return None
-    plain = re.sub(r"[A-Za-z]+$|^[A-Za-z]+", " ", plain).strip()
-    # In XMP `33,30.02` has degrees and minutes; in a table `33,5` is decimal.
-    if plain.count(",") and ("." in plain or plain.count(",") > 1 or side is not None):
-        plain = plain.replace(",", " ")
-    if found := _POINTS.fullmatch(plain) or (_NMEA.fullmatch(plain) if side is not None else None):
-        plain = " ".join(found.groups())
-    if re.search(r"[.,]", _NUMBER.sub("", plain)):
+    numbers = _parted(re.sub(r"[A-Za-z]+$|^[A-Za-z]+", " ", plain).strip(), side is not None)
+    value = _degrees_of_numbers(numbers)
+    if value is None:
         return None
-    words = _NUMBER.findall(plain)
-    value = degrees_of_parts([float(word.replace(",", ".")) for word in words])
-    if value is None or not math.isfinite(value):
-        return None
-    negative = plain.lstrip().startswith(("-", "\u2212"))
     if side is not None:
         return side * value, True
+    negative = numbers.lstrip().startswith(("-", "\u2212"))
     return (-value if negative else value), negative
+
+
+def _without_units(text: str) -> str:
+    """Text without the words and signs of degrees, minutes and seconds that are letters, its side as one of N, S, E, W
+    where Chinese or Japanese says it."""
+    plain = _UNITS.sub(" ", unicodedata.normalize("NFKC", text.replace("\u00ba", " "))).strip()
+    plain = _LOST_SIGN.sub(" ", plain)
+    for signs, side_letter in _SIDES_BY_SIGN.items():
+        plain = re.sub(signs, side_letter, plain)
+    return re.sub("(?<=\\d)[度分秒]", " ", plain)
+
+
+def _parted(plain: str, has_side: bool) -> str:
+    """Text of numbers with blanks between degrees, minutes and seconds that points, commas or nothing parts."""
+    # In XMP `33,30.02` has degrees and minutes; in a table `33,5` is decimal.
+    if plain.count(",") and ("." in plain or plain.count(",") > 1 or has_side):
+        plain = plain.replace(",", " ")
+    found = _POINTS.fullmatch(plain) or (_NMEA.fullmatch(plain) if has_side else None)
+    return " ".join(found.groups()) if found else plain
+
+
+def _degrees_of_numbers(text: str) -> float | None:
+    """Degrees without their sign from text of up to three numbers; None where it has other points and commas."""
+    if re.search(r"[.,]", _NUMBER.sub("", text)):
+        return None
+    value = degrees_of_parts([float(word.replace(",", ".")) for word in _NUMBER.findall(text)])
+    return value if value is not None and math.isfinite(value) else None

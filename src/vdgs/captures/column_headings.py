@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Iterable
 from typing import NamedTuple
 
 #: Kinds of words; of quantities the former are above the sea or the ellipsoid, heights may be over the ground.
@@ -105,34 +106,68 @@ class Heading(NamedTuple):
 
 def read_heading(text: str) -> Heading:
     """What a heading says, word by word."""
+    text = _plain_letters(text)
+    words = _tokens(_BRACKET.sub(" ", text))
+    count = _count_without_unit(words)
+    brackets = [_read_bracket(bracket) for bracket in filter(None, map(str.strip, _BRACKET.findall(text)))]
+    inside = _joined(bracket.meanings for bracket in brackets)
+    outside = meanings_of("".join(words))
+    behind = _joined(map(meanings_of, words[count:]))
+    return Heading(
+        plain="".join(words),
+        stem="".join(words[:count]),
+        meanings=() if outside is None else (*outside, *inside),
+        unread=tuple(each.text for each in brackets if each.meanings is None and not each.packed),
+        side=next((each.side for each in reversed(brackets) if each.side), ""),
+        packed=any(each.packed for each in brackets),
+        units=tuple(each for each in (*inside, *(outside or behind)) if each in LENGTHS or each in ANGLES),
+    )
+
+
+def _plain_letters(text: str) -> str:
+    """Text in lower case without accents, the signs of degrees and feet as words."""
     text = re.sub(r"[\[(]\s*['′’]\s*[\])]", "(ft)", re.sub("[°º]", " deg ", text))
     text = unicodedata.normalize("NFKD", text.casefold())  # accents are signs of their own, brackets are narrow
-    text = "".join(sign for sign in text if not unicodedata.combining(sign))
-    words = [word for word in re.split(r"[\W_]+", _BRACKET.sub(" ", text)) if word]
+    return "".join(sign for sign in text if not unicodedata.combining(sign))
+
+
+def _joined(meanings: Iterable[list[str] | None]) -> list[str]:
+    return [meaning for each in meanings for meaning in each or ()]
+
+
+def _tokens(text: str) -> list[str]:
+    return [word for word in re.split(r"[\W_]+", text) if word]
+
+
+def _count_without_unit(words: list[str]) -> int:
+    """How many of the words of a heading stand before its unit; the first is none."""
     count = len(words)
     while count > 1 and (tail := meanings_of(words[count - 1])) and {*tail} <= {*LENGTHS, *ANGLES, "format"}:
         count -= 1
-    outside, inside = meanings_of("".join(words)), list[str]()
-    unread, side, packed = list[str](), "", False
-    for bracket in filter(None, map(str.strip, _BRACKET.findall(text))):
-        tokens = [token for token in re.split(r"[\W_]+", bracket) if token]
-        found = meanings_of("".join(tokens))
-        if found is None:
-            sides = [_SIDES[token] for token in tokens if token in _SIDES]
-            each = [meanings_of(token) for token in tokens if token not in _SIDES]
-            found = None if None in each or len(sides) > 1 else [word for words in each for word in words or ()]
-            side = sides[0] if found is not None and {*sides} & {"S", "W"} else side
-        together = bool(_PACKED.fullmatch("".join(tokens)))
-        packed |= together
-        unread += [bracket] if found is None and not together else []
-        inside += found or []
-    behind = [meaning for word in words[count:] for meaning in meanings_of(word) or ()]
-    units = [*inside, *(outside or behind)]
-    meanings = () if outside is None else (*outside, *inside)
-    return Heading(
-        "".join(words), "".join(words[:count]), meanings, tuple(unread), side, packed,
-        tuple(each for each in units if each in LENGTHS or each in ANGLES),
-    )  # fmt: skip
+    return count
+
+
+class _Bracket(NamedTuple):
+    """What a bracket of a heading says, as `Heading` has it."""
+
+    text: str
+    meanings: list[str] | None
+    """None where a word is in no table."""
+    side: str
+    packed: bool
+
+
+def _read_bracket(text: str) -> _Bracket:
+    tokens = _tokens(text)
+    packed = bool(_PACKED.fullmatch("".join(tokens)))
+    if (meanings := meanings_of("".join(tokens))) is not None:
+        return _Bracket(text, meanings, "", packed)
+    sides = [_SIDES[token] for token in tokens if token in _SIDES]
+    each = [meanings_of(token) for token in tokens if token not in _SIDES]
+    if None in each or len(sides) > 1:
+        return _Bracket(text, None, "", packed)
+    side = next((letter for letter in sides if letter in ("S", "W")), "")
+    return _Bracket(text, _joined(each), side, packed)
 
 
 def meanings_of(letters: str) -> list[str] | None:

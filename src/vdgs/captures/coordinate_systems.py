@@ -117,14 +117,7 @@ def to_geodetic(
         change = _to_latitude(crs, "EPSG:4326" if flat else "EPSG:4979", own_axes)
         up = _unit_without_heights(crs) if heights_as_xy else 1.0
     except pyproj.exceptions.ProjError:
-        if crs is not None and crs.geodetic_crs is not None:
-            fault = f"{where} names {crs.name}, which PROJ cannot compute. Give the coordinates in another system."
-            raise UnknownSystem(f"{file}: {fault}", header) from None
-        raise UnknownSystem(
-            f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
-            f"and {header[:60]!r} names none.",
-            header,
-        ) from None
+        raise _unknown_system(crs, header, file, where) from None
     shifted = _Shifted(crs, own_axes, file)
 
     def changed(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -144,6 +137,22 @@ def to_geodetic(
         roughly = np.stack([latitude, longitude, *heights, *([z * up] if flat else [])], axis=1)
         return shifted(places, roughly)
 
+    return changed, _name_of_system(crs, header, heights_as_xy)
+
+
+def _unknown_system(crs: Any | None, header: str, file: Path, where: str) -> UnknownSystem:
+    if crs is not None and crs.geodetic_crs is not None:
+        fault = f"{where} names {crs.name}, which PROJ cannot compute. Give the coordinates in another system."
+        return UnknownSystem(f"{file}: {fault}", header)
+    return UnknownSystem(
+        f"{file}: {where} must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
+        f"and {header[:60]!r} names none.",
+        header,
+    )
+
+
+def _name_of_system(crs: Any, header: str, heights_as_xy: bool) -> str:
+    """The name of a system, and behind it what is assumed of its heights and datum."""
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
         name += WITHOUT_GEOID
@@ -156,9 +165,9 @@ def to_geodetic(
             f"; ellipsoid {ellipsoid} but no datum: taken as WGS 84, from which national datums differ by up "
             "to some hundred metres (an EPSG code, or +towgs84, names it)"
         )
-    if flat and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or ""):
+    if len(crs.axis_info) == 2 and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or ""):
         name += _ALL_IN_FEET if heights_as_xy else HEIGHTS_IN_METERS
-    return changed, name
+    return str(name)
 
 
 class _Shifted:

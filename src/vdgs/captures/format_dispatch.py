@@ -219,21 +219,39 @@ def _other_image_folder(root: Path) -> tuple[str, list[str]]:
     likely = [name for name in named if not is_mask_folder(name) and not why_not_read(root / name)]
     if len(likely) == 1 and likely[0].lower() not in ("input", "distorted", "undistorted"):  # of other lenses
         return likely[0], [f"no images/ folder; the photographs in {root / likely[0]} are used (--images chooses)."]
-    above = next((folder for folder in root.resolve().parents[:2] if (folder / "images").is_dir()), None)
-    if above is not None and not named:
-        models = {model.resolve() for model in find_models(above)}
-        both = any(model.resolve() in models for model in find_models(root))
-        give = f"Give the folder of both: {shell_word(above)}"
-        give = give if both else f"Say where: vdgs run {shell_word(root)} --images {shell_word(above / 'images')}"
-        raise CaptureError(f"{root}: is a model alone; its photographs lie beside it. {give}")
-    stems = [match_stem(name) for folder in likely if folder != "." for name in find_images(root / folder)]
-    apart = len(likely) > 1 and "." not in named and len(set(stems)) == len(stems)
-    whole = f"; --images . for those of {' and '.join(likely)} together" if apart else ""
-    named = named or ["FOLDER, wherever it is"]
-    where = f", or name the folder that they are in: {' or '.join(f'--images {name}' for name in named)}"
-    raise CaptureError(
-        f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there{where}{whole}."
+    if not named:
+        _refuse_model_alone(root)
+    raise _no_one_folder(root, named, likely)
+
+
+def _no_one_folder(root: Path, named: list[str], likely: list[str]) -> CaptureError:
+    together = f"; --images . for those of {' and '.join(likely)} together" if _are_apart(root, named, likely) else ""
+    options = " or ".join(f"--images {name}" for name in named or ["FOLDER, wherever it is"])
+    return CaptureError(
+        f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there, or name the folder that "
+        f"they are in: {options}{together}."
     )
+
+
+def _refuse_model_alone(root: Path) -> None:
+    """Raise CaptureError where the photographs of a model lie in one of the two folders above it."""
+    above = next((folder for folder in root.resolve().parents[:2] if (folder / "images").is_dir()), None)
+    if above is None:
+        return
+    models = {model.resolve() for model in find_models(above)}
+    if any(model.resolve() in models for model in find_models(root)):
+        give = f"Give the folder of both: {shell_word(above)}"
+    else:
+        give = f"Say where: vdgs run {shell_word(root)} --images {shell_word(above / 'images')}"
+    raise CaptureError(f"{root}: is a model alone; its photographs lie beside it. {give}")
+
+
+def _are_apart(root: Path, named: list[str], likely: list[str]) -> bool:
+    """Whether photographs lie in several folders alone, and each has a name of its own."""
+    if len(likely) < 2 or "." in named:
+        return False
+    stems = [match_stem(name) for folder in likely for name in find_images(root / folder)]
+    return len(set(stems)) == len(stems)
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -24,38 +23,25 @@ from vdgs.captures.coordinate_systems import (
     datum_error,
     height_unit,
     in_units_of,
-    is_in_degrees,
     join_definition,
-    look_like_degrees,
     names_a_system,
     to_geodetic,
 )
+from vdgs.captures.gps_columns import BY_TIME, DEVIATIONS, Columns, read_columns
 from vdgs.captures.table_columns import (
     NO_DATA,
     UNKNOWN,
     Row,
-    has_time,
     heading_notes,
     known_columns,
-    meters_of,
     number_of,
-    parted_angles,
     plain_number,
     side_letter,
-    told_meters,
-    west_or_east,
-    with_names,
-    with_sides,
     with_units,
 )
 from vdgs.captures.text_tables import LOOKED_AT, Line, read_lines, rows_of
 from vdgs.errors import CaptureError
 
-#: What errors say of a track, which has a position for each moment.
-BY_TIME = (
-    "by time and not by photograph. Let `exiftool -geotag TRACK PHOTOGRAPHS`, or the receiver's own program, write the "
-    "positions into the photographs."
-)
 #: How files begin that have positions but are no tables of them, and what to do.
 _OTHERS = (
     (r"<gpx|<kml|<trainingcenter|^\$g[pnlab][a-z]{3},", f"is a track, {BY_TIME}"),
@@ -68,7 +54,6 @@ _OTHERS = (
         "is JSON. Export a table instead: `exiftool -csv -n -GPS* PHOTOGRAPHS`, or ODM's geo.txt.",
     ),
 )
-_DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
 #: Words of exiftool behind altitudes below the sea, and EXIF's numbers (3 below, over the sea and not the ellipsoid).
 _BELOW = re.compile(r"below|negative|^[13]$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)")
@@ -79,6 +64,19 @@ _O = re.compile(r"\bO\b|(?<=[\d'\"″′°])O$|^O(?=\d)", re.IGNORECASE)
 _NMEA = re.compile(r"\d{4,5}\.\d+")
 #: DJI's list of moments (.MRK): one line for each photograph, by its number.
 _MRK = re.compile(r"([-\d.]+),Lat\s+([-\d.]+),Lon\s+([-\d.]+),Ellh")
+#: What columns say that have no heading.
+_NO_HEADING = Heading("", "", (), ())
+
+
+class _Axis(NamedTuple):
+    """An angle, and the columns of it and of its sides."""
+
+    name: str
+    column: str
+    side_column: str
+
+
+_AXES = (_Axis("latitude", "lat", "latref"), _Axis("longitude", "lon", "lonref"))
 
 
 @dataclass(frozen=True)
@@ -106,39 +104,50 @@ class GpsTable:
     """How far all its places may be off by the datum of its system."""
 
 
-class _Columns(NamedTuple):
-    where: dict[str, int]
-    """Which word of a row is what."""
-    system: str | None
-    """The coordinate system that the table names."""
-    altitude_unit: float | None = None
-    """Metres in one of its altitudes; None where their heading does not say, which are in the system's unit."""
-    system_altitude_unit: float = 1.0
-    """Metres in the unit of the system's heights."""
-    note: str = ""
-    """How columns are read that do not say it themselves."""
-    heights: tuple[str, ...] = ()
-    """Names of the columns of altitudes: the one that is read, and those that are not."""
-    deviation_units: Mapping[str, float] = MappingProxyType({})
-    """Metres in one of each of its accuracies, NaN for angles."""
-    across_units: tuple[float, float] = (1.0, 1.0)
-    """Metres (of angles degrees) in one of x and of y where their names say another unit, as `[km]`; 1 elsewhere."""
-    angles: Mapping[str, Heading] = MappingProxyType({})
-    """The headings of latitudes and longitudes."""
-    o_side: str = ""
-    """What O stands for, E or W, where the headings tell."""
-
-
 def read_gps_table(file: Path) -> GpsTable:
     """The positions in a table. Raises CaptureError for a file that is none, that lacks a column, whose coordinates are
     of an unknown system, or that holds a value that is no position."""
     lines = read_lines(file)
     if any(_MRK.search(line.text) for line in lines):
         return _moments(lines, file)
+    _refuse_others(lines, file)
+    system, body = _system_and_body(lines)
+    if not body:
+        raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
+    all_rows = with_units(rows_of(body))
+    columns, rows = read_columns(all_rows, system, file)
+    if not rows:
+        raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
+    placed = [row for row in rows if _has_place(row, columns)]
+    if not placed:
+        raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
+    positions, system_name = _positions(placed, columns, file)
+    found = [
+        GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
+        for row, position in zip(placed, positions, strict=True)
+    ]
+    headings = all_rows[0].words if len(rows) < len(all_rows) else None
+    notes = _column_notes(columns, headings, rows, file.name)
+    notes += [f"{file.name}: {note}" for note in _height_notes(columns, system_name)]
+    datum_error_m, converted = 0.0, ""
+    if columns.system is not None:
+        datum_error_m, converted = datum_error(columns.system, np.array(positions))
+    notes += [f"{file.name}: positions are {converted} (maps in that system lose nothing)."] if converted else []
+    if len(placed) < len(rows):
+        notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
+    return GpsTable(tuple(found), notes=tuple(notes), datum_error_m=datum_error_m)
+
+
+def _refuse_others(lines: Sequence[Line], file: Path) -> None:
+    """Raise CaptureError for a file that has positions but is no table of them."""
     head = "\n".join(line.text for line in lines[:LOOKED_AT]).lower()
     for begins, what in _OTHERS:
         if re.search(begins, head, re.MULTILINE):
             raise CaptureError(f"{file}: {what}")
+
+
+def _system_and_body(lines: Sequence[Line]) -> tuple[str | None, list[Line]]:
+    """The coordinate system that a line above the table names, and the lines of the table without comments."""
     system, body = None, list[Line]()
     definition, count = join_definition([_after_colon(line.text) for line in lines])
     for line in [Line(lines[0].number, definition), *lines[count:]] if count > 1 else lines:
@@ -147,40 +156,28 @@ def read_gps_table(file: Path) -> GpsTable:
         else:
             body.append(line)
     body = [line for line in body if not line.text.startswith("#") or _is_header(line)]
-    body = [Line(line.number, line.text.lstrip("# ") if k == 0 else line.text) for k, line in enumerate(body)]
-    if not body:
-        raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
-    rows = with_units(rows_of(body))
-    head_row, count = rows[0], len(rows)
-    columns, rows = _columns(rows, system, file)
-    if not rows:
-        raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
-    placed = [row for row in rows if _has_place(row, columns)]
-    if not placed:
-        raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
-    positions, system = _positions(placed, columns, file)
-    found = [
-        GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
-        for row, position in zip(placed, positions, strict=True)
-    ]
+    return system, [Line(line.number, line.text.lstrip("# ") if k == 0 else line.text) for k, line in enumerate(body)]
+
+
+def _column_notes(columns: Columns, headings: list[str] | None, rows: Sequence[Row], table: str) -> list[str]:
+    """How columns are read that do not say it themselves, and what of the headings is not understood."""
+    notes = [f"{table} {columns.note}"] if columns.note else []
+    if headings is not None:
+        doubts = heading_notes(headings, columns.where, [row.words for row in rows])
+        notes += [f"{table}: {doubt}" for doubt in doubts]
+    return notes
+
+
+def _height_notes(columns: Columns, system: str) -> list[str]:
+    """Which of several altitudes is read, and what the name of the system says in doubt of it."""
     notes = list[str]()
-    notes += [f"{file.name} {columns.note}"] if columns.note else []
-    if len(rows) < count:
-        doubts = heading_notes(head_row.words, columns.where, [row.words for row in rows])
-        notes += [f"{file.name}: {doubt}" for doubt in doubts]
     if columns.heights:
         read, *others = map(repr, columns.heights)
-        notes.append(f"{file.name}: altitudes are those of the column {read}, not of {', '.join(others)}.")
-    system = system if columns.altitude_unit in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
-    if doubt := system.partition("; ")[2]:
-        notes.append(f"{file.name}: {doubt}.")
-    datum_error_m, converted = 0.0, ""
-    if columns.system is not None:
-        datum_error_m, converted = datum_error(columns.system, np.array(positions))
-    notes += [f"{file.name}: positions are {converted} (maps in that system lose nothing)."] if converted else []
-    if len(placed) < len(rows):
-        notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
-    return GpsTable(tuple(found), notes=tuple(notes), datum_error_m=datum_error_m)
+        notes.append(f"altitudes are those of the column {read}, not of {', '.join(others)}.")
+    told = system if columns.altitude_unit in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
+    if doubt := told.partition("; ")[2]:
+        notes.append(f"{doubt}.")
+    return notes
 
 
 def _after_colon(text: str) -> str:
@@ -196,116 +193,17 @@ def _is_header(line: Line) -> bool:
     return len(known) > 1 and ("name" in known or "id" in known)
 
 
-def _columns(rows: list[Row], system: str | None, file: Path) -> tuple[_Columns, list[Row]]:
-    """The columns and the rows below their names. Raises CaptureError."""
-    below = [row.words for row in rows[1:]]
-    known = with_sides(with_names(known_columns(rows[0].words), below), below)
-    if {"lat", "lon"} <= set(known) and (parts := parted_angles(rows[0].words)):
-        raise CaptureError(
-            f"{file}: has minutes and seconds in columns of their own ({', '.join(map(repr, parts))}). Write each "
-            "angle into one column: name,lat,lon,alt with degrees such as -33.51234, or words such as 33 30 44.4 S."
-        )
-    unit = told_meters(rows[0].words[known["alt"]]) if "alt" in known else None
-    others = [word for k, word in enumerate(rows[0].words) if "alt" in known_columns([word]) and k != known["alt"]]
-    heights = (rows[0].words[known["alt"]], *others) if others else ()
-    named = {what: rows[0].words[known[what]] for what in _DEVIATIONS if what in known}
-    units = {what: meters_of(word) if read_heading(word).degrees is None else math.nan for what, word in named.items()}
-    if {"name", "lat", "lon"} <= set(known):
-        angles = {what: read_heading(rows[0].words[known[what]]) for what in ("lat", "lon")}
-        latitude, longitude = (1.0 if angle.degrees is None else angle.degrees for angle in angles.values())
-        datum = system if system is not None and _is_datum(system, file) else None
-        columns = _Columns(
-            known, datum, unit, heights=heights, deviation_units=units, across_units=(latitude, longitude),
-            angles=angles, o_side=west_or_east(rows[0].words),
-        )  # fmt: skip
-        return columns, rows[1:]
-    if {"lat", "lon"} <= set(known):
-        found = ", ".join(word for word in rows[0].words if word)
-        remedy = f"It is {BY_TIME}" if has_time(rows[0].words) else "Call the column that has them `name`, or add it."
-        raise CaptureError(f"{file}: has positions but no column of photographs' names (found: {found}). {remedy}")
-    if {"name", "x", "y"} <= set(known):
-        if system is None and "system" in known and len(rows) > 1:
-            k = known["system"]
-            codes = sorted({row.words[k].strip() for row in rows[1:] if k < len(row.words)} - {""})
-            if len(codes) > 1:
-                raise CaptureError(
-                    f"{file}: names several coordinate systems ({', '.join(codes[:3])}). Make a table of each, or give "
-                    "name,lat,lon,alt."
-                )
-            system = f"EPSG:{codes[0]}" if codes and codes[0].isdecimal() else next(iter(codes), None)
-        if system is None and _are_degrees(rows[1:], known):
-            note = "does not say what x and y are; they look like longitude and latitude, and are taken as that."
-            places = {**known, "lon": known["x"], "lat": known["y"]}
-            return _Columns(places, None, unit, heights=heights, deviation_units=units, note=note), rows[1:]
-        if system is None:
-            raise CaptureError(
-                f"{file}: has the columns {rows[0].words[known['x']]!r} and {rows[0].words[known['y']]!r} but does not "
-                "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
-                "give name,lat,lon,alt."
-            )
-        across = meters_of(rows[0].words[known["x"]]), meters_of(rows[0].words[known["y"]])
-        return _Columns(known, system, unit, heights=heights, deviation_units=units, across_units=across), rows[1:]
-    if not _has_numbers(rows[0]):
-        found = ", ".join(sorted(word for word in rows[0].words if word)) or "nothing"
-        marks = "" if system is None else " A list of control points is given as --gcp."
-        if system is None and not known and len(rows) > 1 and _has_numbers(rows[1]):
-            marks = " If it is to name a coordinate system, write its code, such as EPSG:32633."
-        raise CaptureError(
-            f"{file}: needs a first line that names the columns name,lat,lon,alt (found: {found}).{marks}"
-        )
-    order = {"name": 0, "alt": 3} if len(rows[0].words) > 3 else {"name": 0}
-    if len(rows[0].words) > 8:  # ODM, Pix4D: name x y z, three angles and two accuracies
-        order |= {"across": 7, "upwards": 8}
-    if system is not None:
-        return _Columns({**order, "x": 1, "y": 2}, system), rows
-    values = [number_of(row.words[k]) for row in rows for k in (1, 2) if len(row.words) > k]
-    firsts, seconds = np.abs(np.array(values[::2], float)), np.abs(np.array(values[1::2], float))
-    if max(firsts.max(initial=0), seconds.max(initial=0)) > 180:
-        raise CaptureError(
-            f"{file}: names neither its columns nor the coordinate system of values such as {rows[0].words[1]}, "
-            f"{rows[0].words[2]}. Write its code as a first line of its own, such as EPSG:32633."
-        )
-    swapped = firsts.max(initial=0) > 90
-    places = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
-    read = f"name, {'longitude, latitude' if swapped else 'latitude, longitude'}, altitude"
-    more = ", ..., accuracies across and up" if "across" in order else ""
-    note = "" if swapped and not more else f"names no columns; read as {read}{more}."
-    return _Columns({**order, **places}, None, note=note), rows
-
-
-def _is_datum(system: str, file: Path) -> bool:
-    """Whether a line above latitudes and longitudes names a system of degrees other than WGS 84."""
-    if re.fullmatch(r"(?i)(EPSG:)?(4326|4979)|WGS[ _]?84", system):
-        return False
-    try:
-        to_geodetic(system, file)
-    except CaptureError:  # not understood, or pyproj is not there: as before
-        return False
-    return is_in_degrees(system)
-
-
-def _are_degrees(rows: Sequence[Row], known: Mapping[str, int]) -> bool:
-    """Whether x and y are longitudes and latitudes of one place: as metres they would be one and the same point."""
-    words = [[row.words[known[what]] if known[what] < len(row.words) else "" for what in ("x", "y")] for row in rows]
-    places = np.array([[number_of(word) for word in each] for each in words if "" not in each]).reshape(-1, 2)
-    return bool(np.isfinite(places).all() and (np.abs(places) < [180, 90]).all() and look_like_degrees(places))
-
-
-def _has_numbers(row: Row) -> bool:
-    return len(row.words) > 2 and all(math.isfinite(number_of(word)) for word in row.words[1:3])
-
-
-def _word(row: Row, columns: _Columns, what: str) -> str:
+def _word(row: Row, columns: Columns, what: str) -> str:
     k = columns.where.get(what)
     return row.words[k].strip() if k is not None and k < len(row.words) else ""
 
 
-def _has_place(row: Row, columns: _Columns) -> bool:
+def _has_place(row: Row, columns: Columns) -> bool:
     both = ("x", "y") if "x" in columns.where and columns.system is not None else ("lat", "lon")
     return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in UNKNOWN for what in both)
 
 
-def _positions(rows: Sequence[Row], columns: _Columns, file: Path) -> tuple[list[tuple[float, float, float]], str]:
+def _positions(rows: Sequence[Row], columns: Columns, file: Path) -> tuple[list[tuple[float, float, float]], str]:
     """Latitude, longitude and altitude of each row, and the name of the system that they are given in; "" where the
     table names none. Raises CaptureError."""
     if columns.system is None:
@@ -320,13 +218,10 @@ def _positions(rows: Sequence[Row], columns: _Columns, file: Path) -> tuple[list
     return [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)], name
 
 
-def _geodetic(rows: Sequence[Row], columns: _Columns, file: Path) -> list[tuple[float, float, float]]:
+def _geodetic(rows: Sequence[Row], columns: Columns, file: Path) -> list[tuple[float, float, float]]:
     found = []
     for row in rows:
-        angles = [
-            _angle(row, columns, what, reference, axis, file)
-            for what, reference, axis in (("lat", "latref", "latitude"), ("lon", "lonref", "longitude"))
-        ]
+        angles = [_angle(row, columns, axis, file) for axis in _AXES]
         if None in angles:
             words = [_word(row, columns, what) for what in ("lat", "lon", "alt")]
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
@@ -349,60 +244,70 @@ def _other_degrees(latitude: float, longitude: float) -> str:
     return ""
 
 
-def _angle(row: Row, columns: _Columns, what: str, reference: str, axis: str, file: Path) -> float | None:
+def _angle(row: Row, columns: Columns, axis: _Axis, file: Path) -> float | None:
     """An angle of a row in the unit of its column; its own side counts before that of another column or the heading's.
     Raises CaptureError for numbers that the heading says to be no decimal ones, for an O that may be either side, and
     for words in a column of sides that are none.
     """
-    word, side_word, heading = _word(row, columns, what), _word(row, columns, reference), columns.angles.get(what)
-    word = _WORD.sub(lambda match: side_letter(match[0], reference) or match[0], word)
-    if _O.search(word) or _O.search(side_word):
-        if not columns.o_side:
-            raise CaptureError(
-                f"{file}: line {row.number}: O is west (oeste, ouest, ovest) or east (Ost). Write W or E instead."
-            )
-        word, side_word = _O.sub(columns.o_side, word), _O.sub(columns.o_side, side_word)
-    if word.count(",") == 1 and "." not in word:
-        word = word.replace(",", ".")
-    side_word = _side(side_word, reference, axis, f"{file}: line {row.number}") or (
-        heading.side if heading is not None else ""
-    )
+    where, heading = f"{file}: line {row.number}", columns.angles.get(axis.column, _NO_HEADING)
+    word, side_word = _words_of_angle(row, columns, axis, where)
+    side_word = _side(side_word, axis, where) or heading.side
     try:
         number = float(word)
-        read: tuple[float, bool] | None = (number, False)
-        in_minutes = any(_NMEA.fullmatch(_word(row, columns, each)) for each in ("lat", "lon"))
-        if side_word and in_minutes:
-            read = degrees_of_text(f"{abs(number) // 100:.0f} {abs(number) % 100:.9f} {side_word}", axis) or read
-        elif heading is not None and heading.packed:
+    except ValueError:
+        read = degrees_of_text(word, axis.name)
+        if heading.side and read is not None and read[1]:
+            side_word = ""
+    else:
+        in_minutes = bool(side_word) and _has_minutes(row, columns)
+        if heading.packed and not in_minutes:
             raise CaptureError(
-                f"{file}: line {row.number}: {axis} {word}: degrees, minutes and seconds in one number are not read. "
+                f"{where}: {axis.name} {word}: degrees, minutes and seconds in one number are not read. "
                 "Write degrees such as -33.51234, or words such as 33 30 44.4 S."
             )
-    except ValueError:
-        read = degrees_of_text(word, axis)
-        if read is not None and heading is not None and heading.side and read[1]:
-            side_word = ""
+        read = (_degrees_and_minutes(number, side_word, axis) if in_minutes else None) or (number, False)
     if read is None:
         return None
-    side = degrees_of_text(f"{abs(read[0])} {side_word}", axis)
+    side = degrees_of_text(f"{abs(read[0])} {side_word}", axis.name)
     return side[0] if side is not None and side[1] else read[0]
 
 
-def _side(word: str, reference: str, axis: str, where: str) -> str:
+def _has_minutes(row: Row, columns: Columns) -> bool:
+    """Whether one of the angles of a row is degrees and minutes in one number."""
+    return any(_NMEA.fullmatch(_word(row, columns, axis.column)) for axis in _AXES)
+
+
+def _degrees_and_minutes(number: float, side: str, axis: _Axis) -> tuple[float, bool] | None:
+    return degrees_of_text(f"{abs(number) // 100:.0f} {abs(number) % 100:.9f} {side}", axis.name)
+
+
+def _words_of_angle(row: Row, columns: Columns, axis: _Axis, where: str) -> tuple[str, str]:
+    """The words of an angle and of its side, sides in the angle as one letter, O as what it stands for, and a point
+    before decimals."""
+    word, side_word = _word(row, columns, axis.column), _word(row, columns, axis.side_column)
+    word = _WORD.sub(lambda match: side_letter(match[0], axis.side_column) or match[0], word)
+    if _O.search(word) or _O.search(side_word):
+        if not columns.o_side:
+            raise CaptureError(f"{where}: O is west (oeste, ouest, ovest) or east (Ost). Write W or E instead.")
+        word, side_word = _O.sub(columns.o_side, word), _O.sub(columns.o_side, side_word)
+    return word.replace(",", ".") if word.count(",") == 1 and "." not in word else word, side_word
+
+
+def _side(word: str, axis: _Axis, where: str) -> str:
     """N, S, E or W by the word of a column of sides; nothing where it is empty. Raises CaptureError."""
     if word.lower() in UNKNOWN:
         return ""
-    positive, negative = ("N", "S") if axis == "latitude" else ("E", "W")
+    positive, negative = ("N", "S") if axis.name == "latitude" else ("E", "W")
     for said in (word, word.split()[0]):  # `South latitude`
-        if letter := side_letter(said, reference):
+        if letter := side_letter(said, axis.side_column):
             return letter
-        side = degrees_of_text(f"1 {said}", axis)
+        side = degrees_of_text(f"1 {said}", axis.name)
         if side is not None and side[1]:
             return positive if side[0] > 0 else negative
-    raise CaptureError(f"{where}: {word!r} is no side of a {axis}. Write {positive} or {negative} instead.")
+    raise CaptureError(f"{where}: {word!r} is no side of a {axis.name}. Write {positive} or {negative} instead.")
 
 
-def _altitude(row: Row, columns: _Columns, file: Path) -> float:
+def _altitude(row: Row, columns: Columns, file: Path) -> float:
     """The altitude of a row in metres, NaN where it has none."""
     word = _word(row, columns, "alt")
     if word.lower() in UNKNOWN:
@@ -421,7 +326,7 @@ def _altitude(row: Row, columns: _Columns, file: Path) -> float:
 
 
 def _projected(
-    rows: Sequence[Row], columns: _Columns, change: ToGeodetic, system: str, file: Path
+    rows: Sequence[Row], columns: Columns, change: ToGeodetic, system: str, file: Path
 ) -> list[tuple[float, float, float]]:
     places = []
     for row in rows:
@@ -445,9 +350,9 @@ def _projected(
     return [(float(a), float(b), float(c)) for a, b, c in changed]
 
 
-def _deviations(row: Row, columns: _Columns) -> tuple[float, float] | None:
+def _deviations(row: Row, columns: Columns) -> tuple[float, float] | None:
     across, upwards, *sides = (
-        number_of(_word(row, columns, what)) * columns.deviation_units.get(what, 1.0) for what in _DEVIATIONS
+        number_of(_word(row, columns, what)) * columns.deviation_units.get(what, 1.0) for what in DEVIATIONS
     )
     if "across" not in columns.where:
         across = float(np.max(sides))  # NaN where one of them is not known

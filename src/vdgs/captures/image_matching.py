@@ -44,10 +44,7 @@ def match_images(
     cameras without an image. Raises CaptureError where many are missing."""
     folder = root / source.images
     available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
-    found_as: Sequence[str | None] = [available.find(view.name) for view in source.views]
-    if not any(found_as):
-        found_as = find_in_other_folders([view.name for view in source.views], available.images, folder, warnings)
-    paths = [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]
+    paths = _image_paths(source, folder, available, warnings)
     there = [path.is_file() for path in paths]
     missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
     several = several_places(missing, available.images)
@@ -58,20 +55,33 @@ def match_images(
         raise CaptureError("\n".join([str(error), *several, *shrunk])) from None
     views = tuple(view for view, found in zip(source.views, there, strict=True) if found)
     source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
-    named = set(paths)
-    stems = {path.with_suffix("") for path in paths}
-    others = {
-        name: path
-        for spare_folder in source.image_folders
-        for name, path in find_images(spare_folder).items()
-        if path not in named and not _is_mask(path, stems)
-    }
-    used = {path.resolve() for path in paths} if others else set()  # asked of the disk only where names differ
-    spare = [name for name, path in others.items() if path.resolve() not in used]
+    spare = _without_camera(source, paths)
     if spare:
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
     return _fitted(root, source, paths, options, warnings), len(spare)
+
+
+def _image_paths(source: SourceCapture, folder: Path, available: ImageNameIndex, warnings: list[str]) -> list[Path]:
+    """Where the image of each view is, or would be."""
+    found_as: Sequence[str | None] = [available.find(view.name) for view in source.views]
+    if not any(found_as):
+        found_as = find_in_other_folders([view.name for view in source.views], available.images, folder, warnings)
+    return [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]
+
+
+def _without_camera(source: SourceCapture, paths: list[Path]) -> list[str]:
+    """The images in the capture's folders that are neither at these paths nor masks of those that are."""
+    named = set(paths)
+    stems = {path.with_suffix("") for path in paths}
+    others = {
+        name: path
+        for folder in source.image_folders
+        for name, path in find_images(folder).items()
+        if path not in named and not _is_mask(path, stems)
+    }
+    used = {path.resolve() for path in paths} if others else set()  # asked of the disk only where names differ
+    return [name for name, path in others.items() if path.resolve() not in used]
 
 
 def _other_names_in_shrunk(source: SourceCapture, root: Path, available: ImageNameIndex) -> list[str]:

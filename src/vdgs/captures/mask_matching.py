@@ -23,35 +23,43 @@ def find_masks(
     of them is of a photograph.
     """
     asked_for = options.masks != CaptureOptions.masks
-    shrunk = largest_shrunk(root, CaptureOptions.masks)  # as nerfstudio has them beside images_2, images_4, ...
-    names = () if asked_for else (*MASK_FOLDERS, *([shrunk] if shrunk else []))
-    folder = next((root / name for name in names if (root / name).is_dir()), root / options.masks)
-    if asked_for and not folder.is_dir() and Path(options.masks).is_dir():
-        folder = Path(options.masks)  # given from where the person stands
+    folder = _mask_folder(root, options)
     if asked_for and not folder.is_dir():
         moving = (
             " Of what moves they are made by --masks masks --block.mask-moving on." if options.masks == "auto" else ""
         )
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.{moving}")
-    masks = dict[str, Path | None]()
-    for view in views:
-        photograph = view.image_path or find_file(root / images, view.name)
-        mask = view.mask_path or find_mask(folder, view.name)
-        if mask is not None and photograph is not None and mask.is_file() and mask.samefile(photograph):
-            raise CaptureError(
-                f"{mask}: is the photograph itself, not a mask of it. Name the folder of the masks (--masks)."
-            )
-        masks[view.name] = mask or find_mask_beside(root / images, view.name, photograph)
-    with_mask = [name for name, mask in masks.items() if mask is not None]
+    masks = {view.name: _mask_of(view, root / images, folder) for view in views}
     if folder.is_dir() and not any(view.mask_path for view in views):
         _compare(folder, masks, asked_for, warnings)
-    if 0 < len(with_mask) < len(masks):
-        without = next(name for name, mask in masks.items() if mask is None)
+    without = [name for name, mask in masks.items() if mask is None]
+    if 0 < len(without) < len(masks):
         warnings.append(
-            f"{len(with_mask)} of {len(masks)} photographs have a mask; the others count whole. If that is not meant, "
-            f"put the missing masks there, such as {folder / mask_name(without)}."
+            f"{len(masks) - len(without)} of {len(masks)} photographs have a mask; the others count whole. If that is "
+            f"not meant, put the missing masks there, such as {folder / mask_name(without[0])}."
         )
     return masks
+
+
+def _mask_folder(root: Path, options: CaptureOptions) -> Path:
+    """The folder that `--masks` names, in the capture or from where the person stands; else one of those known."""
+    if options.masks == CaptureOptions.masks:
+        shrunk = largest_shrunk(root, CaptureOptions.masks)  # as nerfstudio has them beside images_2, images_4, ...
+        names = (*MASK_FOLDERS, *([shrunk] if shrunk else []))
+        return next((root / name for name in names if (root / name).is_dir()), root / options.masks)
+    inside, elsewhere = root / options.masks, Path(options.masks)
+    return elsewhere if not inside.is_dir() and elsewhere.is_dir() else inside
+
+
+def _mask_of(view: SourceView, images: Path, folder: Path) -> Path | None:
+    """The mask that the view names, else that in the folder of masks, else that beside its photograph."""
+    photograph = view.image_path or find_file(images, view.name)
+    mask = view.mask_path or find_mask(folder, view.name)
+    if mask is not None and photograph is not None and mask.is_file() and mask.samefile(photograph):
+        raise CaptureError(
+            f"{mask}: is the photograph itself, not a mask of it. Name the folder of the masks (--masks)."
+        )
+    return mask or find_mask_beside(images, view.name, photograph)
 
 
 def _compare(folder: Path, masks: dict[str, Path | None], asked_for: bool, warnings: list[str]) -> None:

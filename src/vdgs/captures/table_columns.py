@@ -165,15 +165,7 @@ def west_or_east(words: Sequence[str]) -> str:
 def heading_notes(words: Sequence[str], known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> list[str]:
     """What to say of headings whose brackets are not understood, and of columns that are not read though they may be
     altitudes."""
-    notes = []
-    for what in ("lat", "lon", "x", "y", "alt", "across", "upwards", "eastwards", "northwards"):
-        if what not in known or known[what] >= len(words):
-            continue
-        heading = read_heading(words[known[what]])
-        wrong = [each for each in heading.units if (each in LENGTHS) == (what in ("lat", "lon"))]
-        if heading.unread or (wrong and what in ("lat", "lon", "alt")):
-            unit = "degrees" if what in ("lat", "lon") else "metres"
-            notes.append(f"the unit of the column {words[known[what]]!r} is not understood; read as {unit}.")
+    notes = _unit_notes(words, known)
     if "alt" in known:
         return notes
     ground = [word for word in words if _is_other_height(read_heading(word))]
@@ -192,6 +184,20 @@ def heading_notes(words: Sequence[str], known: Mapping[str, int], rows: Sequence
         notes.append(
             f"no column is known as the altitude; not read: {', '.join(spare[:6])}. If one is it, call it `alt`."
         )
+    return notes
+
+
+def _unit_notes(words: Sequence[str], known: Mapping[str, int]) -> list[str]:
+    """What to say of headings whose units are not understood, or are none of angles (of lengths for altitudes)."""
+    notes = []
+    for what in ("lat", "lon", "x", "y", "alt", "across", "upwards", "eastwards", "northwards"):
+        if what not in known or known[what] >= len(words):
+            continue
+        heading, is_angle = read_heading(words[known[what]]), what in ("lat", "lon")
+        wrong = any((each in LENGTHS) == is_angle for each in heading.units)
+        if heading.unread or (wrong and (is_angle or what == "alt")):
+            unit = "degrees" if is_angle else "metres"
+            notes.append(f"the unit of the column {words[known[what]]!r} is not understood; read as {unit}.")
     return notes
 
 

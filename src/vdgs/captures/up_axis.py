@@ -9,6 +9,8 @@ congruent): it is taken for the flight, with a warning.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vdgs.geometry.similarity import geometric_median
@@ -41,6 +43,21 @@ UPPER_SIDES = "upper sides of the photographs up"
 HINT = "--up x|y|z|-x|-y|-z says it outright."
 
 
+class _Views(NamedTuple):
+    """How cameras look, together."""
+
+    rights: np.ndarray
+    """The right vector of each [n, 3]."""
+    image_up: np.ndarray
+    """The mean of their image-ups [3]."""
+    forward: np.ndarray
+    """The mean of their views [3]."""
+    same_side: bool
+    """Whether all have the same side up."""
+    parallel: bool
+    """Whether their right vectors are parallel."""
+
+
 def estimate_up(
     centers: np.ndarray, rotations: np.ndarray, points: np.ndarray, warnings: list[str]
 ) -> tuple[np.ndarray, str]:
@@ -49,43 +66,61 @@ def estimate_up(
     `centers` [n, 3], `rotations` [n, 3, 3] (rows: right, down and forward of a camera) and `points` [m, 3] in the
     source world. All of it turns with the world (no per-axis medians).
     """
-    rights, image_up, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
-    same_side = float(np.linalg.norm(image_up)) >= MIN_UP_AGREEMENT
-    parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < MAX_ROLL)
-    up, uncertain = _least_variance(centers, points)
-    how = "least variance of cameras and points"
-    if not same_side and np.linalg.norm(forward) >= LOOKS_DOWN and abs(forward @ up) < MIN_DOWN_COSINE:
-        # All look the same way, which is across the axis: cameras of several heights spread farther up than sideways.
-        flat, doubt = _least_variance(points)
-        if abs(forward @ flat) >= MIN_DOWN_COSINE:
-            up, uncertain, how = flat, doubt, "least variance of points"
-    neither = abs(forward @ up) < MIN_VIEW_COSINE and abs(image_up @ up) < MIN_UPRIGHT_COSINE
-    rolled = _roll(rights, up) > (MAX_ROLL_PARALLEL if parallel else MAX_ROLL)
-    if same_side and (neither or rolled or (uncertain and not parallel)):
-        up, how = _level(rights, image_up), "level cameras"
-        if parallel:
-            warnings.append(
-                "the photographs look one way or its opposite: up is taken from their upper sides, and is off by as "
-                f"much as they look up or down on average. {HINT}"
-            )
-    elif uncertain:
-        warnings.append(
-            "the up axis is uncertain: cameras and points spread about as far up as sideways. "
-            f"Look at the figures of `vdgs inspect`; {HINT}"
-        )
-    own, looking = float(image_up @ up), float(forward @ up)
+    views = _views(rotations)
+    axis, how = _axis(views, centers, points, warnings)
+    own, looking = float(views.image_up @ axis), float(views.forward @ axis)
     if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
-        return (-up if own < 0 else up), f"{how}, {UPPER_SIDES}"
+        return (-axis if own < 0 else axis), f"{how}, {UPPER_SIDES}"
     if abs(looking) >= MIN_VIEW_COSINE:
-        if same_side and parallel and 2 * abs(own) < abs(looking) and not _turn_about(up, rights, image_up):
+        one_side = views.same_side and views.parallel and 2 * abs(own) < abs(looking)
+        if one_side and not _turn_about(axis, views.rights, views.image_up):
             warnings.append(
                 "all photographs look the same way with the same side up: straight down on ground, or level at a "
                 f"wall. Taken for down; if it is a wall, {HINT}"
             )
-        return (-up if looking > 0 else up), f"{how}, against the view"
-    above = float(np.median(centers @ up) - np.median(points @ up))
+        return (-axis if looking > 0 else axis), f"{how}, against the view"
+    above = float(np.median(centers @ axis) - np.median(points @ axis))
     warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
-    return (-up if above < 0 else up), f"{how}, cameras above"
+    return (-axis if above < 0 else axis), f"{how}, cameras above"
+
+
+def _views(rotations: np.ndarray) -> _Views:
+    rights, image_up, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
+    same_side = float(np.linalg.norm(image_up)) >= MIN_UP_AGREEMENT
+    parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < MAX_ROLL)
+    return _Views(rights, image_up, forward, same_side, parallel)
+
+
+def _axis(views: _Views, centers: np.ndarray, points: np.ndarray, warnings: list[str]) -> tuple[np.ndarray, str]:
+    """Up, of either sign, and how it was found: by the shape of the flight, or by cameras that are held level."""
+    axis, uncertain, how = _flight_axis(views, centers, points)
+    neither = abs(views.forward @ axis) < MIN_VIEW_COSINE and abs(views.image_up @ axis) < MIN_UPRIGHT_COSINE
+    rolled = _roll(views.rights, axis) > (MAX_ROLL_PARALLEL if views.parallel else MAX_ROLL)
+    if views.same_side and (neither or rolled or (uncertain and not views.parallel)):
+        if views.parallel:
+            warnings.append(
+                "the photographs look one way or its opposite: up is taken from their upper sides, and is off by as "
+                f"much as they look up or down on average. {HINT}"
+            )
+        return _level(views.rights, views.image_up), "level cameras"
+    if uncertain:
+        warnings.append(
+            "the up axis is uncertain: cameras and points spread about as far up as sideways. "
+            f"Look at the figures of `vdgs inspect`; {HINT}"
+        )
+    return axis, how
+
+
+def _flight_axis(views: _Views, centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, bool, str]:
+    """The axis of least variance, whether it is uncertain, and of what it is."""
+    axis, uncertain = _least_variance(centers, points)
+    forward = views.forward
+    if not views.same_side and np.linalg.norm(forward) >= LOOKS_DOWN and abs(forward @ axis) < MIN_DOWN_COSINE:
+        # All look the same way, which is across the axis: cameras of several heights spread farther up than sideways.
+        flat, doubt = _least_variance(points)
+        if abs(forward @ flat) >= MIN_DOWN_COSINE:
+            return flat, doubt, "least variance of points"
+    return axis, uncertain, "least variance of cameras and points"
 
 
 def _least_variance(*places: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -10,7 +10,8 @@ transforms_train/transforms_test pairs (Blender): then the world's scale is not 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -68,6 +69,23 @@ def pose_files(root: Path) -> list[tuple[Path, Split]]:
     return []
 
 
+@dataclass
+class _Frames:
+    """What the pose files of a capture say, as it is read."""
+
+    views: list[SourceView] = field(default_factory=list)
+    units: set[float] = field(default_factory=set)
+    """Of the worlds of the files, in metres if they are MatrixCity's."""
+    missing: list[str] = field(default_factory=list)
+    """Names of photographs that are not there."""
+    missing_tests: list[str] = field(default_factory=list)
+    bad: dict[str, CaptureError] = field(default_factory=dict)
+    """Photographs whose pose cannot be used."""
+    count: int = 0
+    tests: int = 0
+    is_city: bool = False
+
+
 def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = True) -> SourceCapture:
     """The capture in MatrixCity's layout, its world as in the files (z up).
 
@@ -75,56 +93,27 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
     `CaptureError` for missing images, non-rigid poses and missing points.
     """
     files = pose_files(root)
-    views: list[SourceView] = []
-    scales: set[float] = set()
-    missing: list[str] = []
-    lost: list[str] = []
-    bad: dict[str, CaptureError] = {}
-    count, tests, is_city = 0, 0, False
-    photographs = FramePhotographs(root, options.images)
-    for file, split in files:
-        content = read_capture_json(file)
-        if split == "test" and content.get("frames") == []:
-            continue  # as programs write that hold no photograph out: no test file
-        for frame in get_frames(content, file):
-            count, is_city = count + 1, is_city or _of_a_city(frame)
-            image = photographs.find(frame, file, split)
-            tests += split == "test"
-            if isinstance(image, str):
-                missing.append(image)
-                lost += [image] if split == "test" else []
-                continue
-            try:
-                view, scale = _read_frame(image, frame, content, file, split, root)
-            except BadPose as error:
-                bad[image[0]] = error
-                continue
-            views.append(view)
-            scales.add(scale)
-    warnings = _missing(missing, count, root / (options.images or ""), options.strict, is_city)
-    warnings += tuple(refuse_lost_tests(lost, tests, files[-1][0], root, options))
-    tested = {view.image_path for view in views if view.split == "test"}
-    views, both = without_tested(views, {view.name for view in views if view.image_path in tested})
-    views, warnings = one_view_each(views, root, bad), warnings + tuple(both)
+    read = _read_frames(files, root, options)
+    warnings = _missing(read.missing, read.count, root / (options.images or ""), options.strict, read.is_city)
+    warnings += refuse_lost_tests(read.missing_tests, read.tests, files[-1][0], root, options)
+    views, both = _without_tested_files(read.views)
+    views = one_view_each(views, root, read.bad)
+    warnings += both
     if any(file.name == VALIDATION_FILE for file, _ in files):
-        warnings += (f"there is no {TEST_FILE}: the photographs of {VALIDATION_FILE} are for the test.",)
-    warnings += tuple(leave_out_bad_poses(bad, count - len(missing), files[0][0], options.strict))
-    if is_city and len(scales) > 1:
+        warnings.append(f"there is no {TEST_FILE}: the photographs of {VALIDATION_FILE} are for the test.")
+    warnings += leave_out_bad_poses(read.bad, read.count - len(read.missing), files[0][0], options.strict)
+    if read.is_city and len(read.units) > 1:
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
-    what = "MatrixCity's layout" if is_city else files[0][0].name
+    what = "MatrixCity's layout" if read.is_city else files[0][0].name
     points, colors = find_sparse_points(root, poses, what, images=options.images, needs_points=needs_points)
-    world = WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
-    if is_city:
-        unit = scales.pop()
-        world = WorldPrior(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
-    elif needs_points and any(_is_transparent(view.image_path) for view in views[:1]):
-        warnings += (
+    if not read.is_city and needs_points and any(_is_transparent(view.image_path) for view in views[:1]):
+        warnings.append(
             "what is transparent is left out of training and figures, as by a mask. Figures of sets of Blender are "
             f"usual on white: without the points beside the set, vdgs sfm {shell_word(root)} --output CAPTURE makes it "
-            "white.",
+            "white."
         )
-    if not tests:  # no test files: the split is ours to choose
+    if not read.tests:  # no test files: the split is ours to choose
         views = [replace(view, split=None) for view in views]
     return SourceCapture(
         source="matrixcity",
@@ -132,9 +121,47 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         views=tuple(views),
         points=points,
         colors=colors,
-        world=world,
-        warnings=warnings,
+        world=_world(read),
+        warnings=tuple(warnings),
     )
+
+
+def _read_frames(files: Sequence[tuple[Path, Split]], root: Path, options: CaptureOptions) -> _Frames:
+    read = _Frames()
+    photographs = FramePhotographs(root, options.images)
+    for file, split in files:
+        content = read_capture_json(file)
+        if split == "test" and content.get("frames") == []:
+            continue  # as programs write that hold no photograph out: no test file
+        for frame in get_frames(content, file):
+            read.count, read.is_city = read.count + 1, read.is_city or _of_a_city(frame)
+            image = photographs.find(frame, file, split)
+            read.tests += split == "test"
+            if isinstance(image, str):
+                read.missing.append(image)
+                read.missing_tests += [image] if split == "test" else []
+                continue
+            try:
+                view, unit = _read_frame(image, frame, content, file, split, root)
+            except BadPose as error:
+                read.bad[image[0]] = error
+                continue
+            read.views.append(view)
+            read.units.add(unit)
+    return read
+
+
+def _without_tested_files(views: list[SourceView]) -> tuple[list[SourceView], list[str]]:
+    """`without_tested` by the files of the photographs, whatever their names."""
+    tested = {view.image_path for view in views if view.split == "test"}
+    return without_tested(views, {view.name for view in views if view.image_path in tested})
+
+
+def _world(read: _Frames) -> WorldPrior:
+    if not read.is_city:
+        return WorldPrior(np.eye(3), 1.0, False, "z is up by the format")
+    (unit,) = read.units
+    return WorldPrior(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
 
 
 def _is_transparent(image: Path | None) -> bool:
@@ -154,9 +181,9 @@ def _of_a_city(frame: JsonObject) -> bool:
     return bool(in_block and _NUMBERED.fullmatch(parts[-1]))
 
 
-def _missing(missing: list[str], count: int, folder: Path, strict: bool, is_city: bool) -> tuple[str, ...]:
+def _missing(missing: list[str], count: int, folder: Path, strict: bool, is_city: bool) -> list[str]:
     try:
-        return tuple(refuse_many_missing(missing, count, folder, strict))
+        return [*refuse_many_missing(missing, count, folder, strict)]
     except CaptureError as error:
         if not is_city:
             raise

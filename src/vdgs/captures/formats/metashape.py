@@ -48,6 +48,13 @@ _UNIT = re.compile(r"\bUNIT\[\s*\"([^\"]+)\"\s*,\s*(\d*\.?\d+(?:[eE][+-]?\d+)?)\
 #: Cameras and their references spread alike up to so much (logarithm of the ratio; choice).
 SAME_SIZE = 0.2
 _FALSE = ("0", "false")
+#: Why cameras are left out, in the order in which they are named.
+_UNALIGNED, _OTHER_BANDS, _NO_OFFSET, _DISABLED = _LEFT_OUT = (
+    "are not aligned",
+    "show other bands than the masters of their multi-camera systems",
+    "belong to a multi-camera system whose file does not say where their sensors are",
+    "are disabled",
+)
 
 
 def is_file(file: Path) -> bool:
@@ -181,23 +188,25 @@ class _Chunk:
 
     def _used(self, cameras: list[_Camera]) -> list[_Camera]:
         """Cameras that are aligned and enabled; the others are named."""
-        off = [camera for camera in cameras if camera.element.get("enabled", "1") in _FALSE]
-        on = [camera for camera in cameras if camera.element.get("enabled", "1") not in _FALSE]
-        slaves = [camera for camera in on if camera.element.find("transform") is None and camera.master is not None]
-        bands = [camera for camera in slaves if not self._shows_what_its_master_does(camera)]
-        bare = [camera for camera in slaves if camera.is_aligned and camera not in bands and not self._offset(camera)]
-        unaligned = [camera for camera in on if not camera.is_aligned and camera not in bands]
-        for some, what in (
-            (unaligned, "are not aligned"),
-            (bands, "show other bands than the masters of their multi-camera systems"),
-            (bare, "belong to a multi-camera system whose file does not say where their sensors are"),
-            (off, "are disabled"),
-        ):
-            if some:
+        kinds: dict[str, list[_Camera]] = {why: [] for why in ("", *_LEFT_OUT)}
+        for camera in cameras:
+            kinds[self._why_left_out(camera)].append(camera)
+        for why in _LEFT_OUT:
+            if some := kinds[why]:
                 names = ", ".join(camera.label for camera in some)
-                self._warnings.append(f"{len(some)} cameras {what} and are left out ({names}).")
-        lost = {id(camera) for some in (unaligned, bands, bare) for camera in some}
-        return [camera for camera in on if id(camera) not in lost]
+                self._warnings.append(f"{len(some)} cameras {why} and are left out ({names}).")
+        return kinds[""]
+
+    def _why_left_out(self, camera: _Camera) -> str:
+        """One of `_LEFT_OUT`, or nothing for a camera that is used."""
+        if camera.element.get("enabled", "1") in _FALSE:
+            return _DISABLED
+        is_slave = camera.element.find("transform") is None and camera.master is not None
+        if is_slave and not self._shows_what_its_master_does(camera):
+            return _OTHER_BANDS
+        if not camera.is_aligned:
+            return _UNALIGNED
+        return _NO_OFFSET if is_slave and not self._offset(camera) else ""
 
     def _shows_what_its_master_does(self, camera: _Camera) -> bool:
         """Not so for the bands of a multispectral camera, which are no photographs of the scene as people see it."""
@@ -329,6 +338,20 @@ class _Chunk:
         meters = float(unit[2]) if unit is not None else 1.0
         if unit is None or not meters > 0 or abs(meters - 1) < 1e-3:
             return 1.0
+        places, references = self._places_and_references(transforms)
+        spread = [float(np.sqrt(np.var(each, axis=0).sum())) if len(each) > 2 else 0.0 for each in (places, references)]
+        ratio = spread[1] / spread[0] if min(spread) > 0 else 0.0
+        counts_in_unit = bool(ratio) and abs(np.log(ratio)) < SAME_SIZE
+        shown = counts_in_unit or (bool(ratio) and abs(np.log(ratio * meters)) < SAME_SIZE)
+        why = "as the references of its cameras show" if shown else "which nothing in the file shows"
+        taken = unit[1] if counts_in_unit else "metres"
+        self._warnings.append(f"its local coordinates are in {unit[1]}; its poses are taken as {taken}, {why}.")
+        return meters if counts_in_unit else 1.0
+
+    def _places_and_references(
+        self, transforms: Mapping[str, Similarity]
+    ) -> tuple[list[np.ndarray], list[list[float]]]:
+        """Where cameras are by their poses, and by their references, of those that have both."""
         places, references = [], []
         for camera in self._element.iter("camera"):
             pose, reference = camera.find("transform"), camera.find("reference")
@@ -340,14 +363,7 @@ class _Chunk:
                 matrix = xml_numbers(pose.text, 16, self._file, f"the transform of {label}")
                 places.append(transforms[key].apply(np.array(matrix[3:12:4])))
                 references.append(xml_numbers(" ".join(words), 3, self._file, f"the reference of {label}"))
-        spread = [float(np.sqrt(np.var(each, axis=0).sum())) if len(each) > 2 else 0.0 for each in (places, references)]
-        ratio = spread[1] / spread[0] if min(spread) > 0 else 0.0
-        counts_in_unit = bool(ratio) and abs(np.log(ratio)) < SAME_SIZE
-        shown = counts_in_unit or (bool(ratio) and abs(np.log(ratio * meters)) < SAME_SIZE)
-        why = "as the references of its cameras show" if shown else "which nothing in the file shows"
-        taken = unit[1] if counts_in_unit else "metres"
-        self._warnings.append(f"its local coordinates are in {unit[1]}; its poses are taken as {taken}, {why}.")
-        return meters if counts_in_unit else 1.0
+        return places, references
 
     @property
     def _wkt(self) -> str:

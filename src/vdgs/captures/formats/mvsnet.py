@@ -144,33 +144,53 @@ class _Photographs:
         without gaps, equally many and apart by 1, their numbers mean their order. Raises `CaptureError` where that may
         be so and cannot be told.
         """
-        found = {label: image for label in labels if (image := self.find(label)) is not None}
+        found = self._find_each(labels)
         if len(found) == len(labels):
             return found, []
         numbers = sorted(int(label) for label in labels if label.isdecimal())
-        theirs = sorted(number for number, files in self._numbered.items() if len(files) == 1)
+        theirs = self._single_numbers()
         if not theirs or len(numbers) != len(labels) or (numbers[0] == theirs[0] and numbers[-1] == theirs[-1]):
             return found, []
         by_name = any(label == image.stem for label, image in found.items())
         is_shifted = len(numbers) == len(theirs) and _without_gaps(numbers) and _without_gaps(theirs)
         if is_shifted and not by_name and theirs[0] - numbers[0] == 1:
-            pairs = dict(zip(numbers, theirs, strict=True))
             note = (
                 f"cameras in {cameras.name} are counted from {numbers[0]} and photographs from {theirs[0]}: paired in "
                 "their order."
             )
-            return {label: self._numbered[pairs[int(label)]][0] for label in labels}, [note]
-        over = set(numbers) - set(theirs), set(theirs) - set(numbers)
-        if is_shifted or (found and not by_name and over[0] and (over[1] or theirs[0] > numbers[0])):
-            file = self._numbered[theirs[0]][0]
-            raise CaptureError(
-                f"{file.parent}: the {len(theirs)} photographs are numbered from {theirs[0]} to {theirs[-1]}, and the "
-                f"{len(numbers)} cameras in {cameras} from {numbers[0]} to {numbers[-1]}: which belong together cannot "
-                f"be told, for {numbers[0]} may be the camera of {file.name}. Rename the photographs as the cameras "
-                f"are named ({labels[0]}{file.suffix} for {labels[0]}{CAMERA_END}), or take cameras and photographs "
-                "that have no partner out of the folders."
-            )
+            return self._in_order(labels, numbers, theirs), [note]
+        if is_shifted or (found and not by_name and _may_be_shifted(numbers, theirs)):
+            raise self._cannot_be_told(labels, cameras, numbers, theirs)
         return found, []
+
+    def _find_each(self, labels: Sequence[str]) -> dict[str, Path]:
+        return {label: image for label in labels if (image := self.find(label)) is not None}
+
+    def _single_numbers(self) -> list[int]:
+        """The numbers that one photograph alone has."""
+        return sorted(number for number, files in self._numbered.items() if len(files) == 1)
+
+    def _in_order(self, labels: Sequence[str], numbers: Sequence[int], theirs: Sequence[int]) -> dict[str, Path]:
+        pairs = dict(zip(numbers, theirs, strict=True))
+        return {label: self._numbered[pairs[int(label)]][0] for label in labels}
+
+    def _cannot_be_told(
+        self, labels: Sequence[str], cameras: Path, numbers: Sequence[int], theirs: Sequence[int]
+    ) -> CaptureError:
+        file = self._numbered[theirs[0]][0]
+        return CaptureError(
+            f"{file.parent}: the {len(theirs)} photographs are numbered from {theirs[0]} to {theirs[-1]}, and the "
+            f"{len(numbers)} cameras in {cameras} from {numbers[0]} to {numbers[-1]}: which belong together cannot "
+            f"be told, for {numbers[0]} may be the camera of {file.name}. Rename the photographs as the cameras "
+            f"are named ({labels[0]}{file.suffix} for {labels[0]}{CAMERA_END}), or take cameras and photographs "
+            "that have no partner out of the folders."
+        )
+
+
+def _may_be_shifted(numbers: Sequence[int], theirs: Sequence[int]) -> bool:
+    """Whether cameras of these numbers lack photographs of theirs in a way that a count from another number leaves."""
+    without_photograph, without_camera = set(numbers) - set(theirs), set(theirs) - set(numbers)
+    return bool(without_photograph) and (bool(without_camera) or theirs[0] > numbers[0])
 
 
 def _without_gaps(numbers: Sequence[int]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,36 +69,51 @@ def read_vertices(
 
 def _header(data: bytes, file: Path, needs: tuple[str, ...]) -> _Header:
     listed = ", ".join(needs)
+    try:
+        lines, start = _header_lines(data)
+        form, count, fields = _declared(lines)
+        if form not in BYTE_ORDERS:
+            raise _NotRead(f"is of format {form!r}")
+        if count < 0 or not {*needs} <= set(fields):
+            raise _NotRead(f"announces no vertices with {listed}")
+    except _NotRead as fault:
+        raise CaptureError(f"{file}: {fault}. A PLY point cloud with {listed} is needed.") from None
+    layout = np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields.items()])
+    return _Header(form, count, layout, start, fields)
 
-    def fail(what: str) -> CaptureError:
-        return CaptureError(f"{file}: {what}. A PLY point cloud with {listed} is needed.")
 
+class _NotRead(Exception):
+    """What is wrong with a header."""
+
+
+def _header_lines(data: bytes) -> tuple[list[str], int]:
+    """The lines of the header, and where the vertices begin."""
     end = data.find(b"\nend_header", 0, MAX_HEADER_BYTES)
     start = data.find(b"\n", end + 1) + 1
     if not data.startswith(b"ply") or end < 0 or start == 0:
-        raise fail("has no PLY header")
+        raise _NotRead("has no PLY header")
+    return data[:end].decode("latin-1").splitlines(), start
+
+
+def _declared(lines: Sequence[str]) -> tuple[str, int, dict[str, str]]:
+    """The format, how many vertices there are (less than 0 where that is not said), and what kind of number each of
+    their properties is."""
     form, element, count = "", "", -1
-    fields: list[tuple[str, str]] = []
-    for line in data[:end].decode("latin-1").splitlines():
-        words = line.split()
-        if len(words) >= 2 and words[0] == "format":
-            form = words[1]
-        elif len(words) == 3 and words[0] == "element":
-            if words[1] != "vertex" and count < 0:
-                raise fail(f"starts with the element {words[1]!r} instead of vertices")
-            element = words[1]
-            if element == "vertex":
-                count = int(words[2]) if words[2].isdecimal() and len(words[2]) < 12 else -2
-        elif words and words[0] == "property" and element == "vertex":
-            if len(words) != 3 or words[1] not in PLY_DTYPES or words[2] in dict(fields):
-                raise fail(f"has a vertex property that is not understood ({line.strip()!r})")
-            fields.append((words[2], PLY_DTYPES[words[1]]))
-    if form not in BYTE_ORDERS:
-        raise fail(f"is of format {form!r}")
-    if count < 0 or not {*needs} <= set(dict(fields)):
-        raise fail(f"announces no vertices with {listed}")
-    layout = np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields])
-    return _Header(form, count, layout, start, dict(fields))
+    fields: dict[str, str] = {}
+    for line in lines:
+        match line.split():
+            case ["format", named, *_]:
+                form = named
+            case ["element", element, number]:
+                if element != "vertex" and count < 0:
+                    raise _NotRead(f"starts with the element {element!r} instead of vertices")
+                if element == "vertex":
+                    count = int(number) if number.isdecimal() and len(number) < 12 else -2
+            case ["property", *words] if element == "vertex":
+                if len(words) != 2 or words[0] not in PLY_DTYPES or words[1] in fields:
+                    raise _NotRead(f"has a vertex property that is not understood ({line.strip()!r})")
+                fields[words[1]] = PLY_DTYPES[words[0]]
+    return form, count, fields
 
 
 def _binary(data: bytes, header: _Header, file: Path) -> np.ndarray:

@@ -52,31 +52,45 @@ def find_photographs(
         found = [name or _of_size(each, size, images) for name, each, size in zip(found, meant, sizes, strict=True)]
     unclear = [each for name, each in zip(found, meant, strict=True) if name is None and len(each) > 1]
     _refuse_many_unclear(unclear, len(names) - found.count(None), len(names), file)
-    relative = folder.relative_to(root).as_posix() if folder.is_relative_to(root) else folder.as_posix()
     if not any(found):
-        wanted = ", ".join(each[0] for each in names[:3]) + (", ..." if len(names) > 3 else "")
-        have = f"holds {len(images)} others ({', '.join(list(images)[:3])}, ...)" if images else "holds no photographs"
-        raise CaptureError(
-            f"{file}: none of its {len(names)} photographs is in {folder}, which {have}. It names {wanted}. Say which "
-            "folder they are in: --images FOLDER"
-        )
+        raise _none_there(names, folder, images, file)
+    _refuse_shared(found, file)
+    chosen = [name for name, each in zip(found, meant, strict=True) if name is not None and len(each) > 1]
+    notes = _notes_on_several(unclear, chosen, folder)
+    called = [name or _plain(each[0]) for name, each in zip(found, names, strict=True)]
+    paths = tuple(images.get(name, folder / name) for name in called)
+    relative = folder.relative_to(root) if folder.is_relative_to(root) else folder
+    return FoundPhotographs(relative.as_posix(), tuple(called), paths, notes)
+
+
+def _none_there(names: Sequence[tuple[str, ...]], folder: Path, images: dict[str, Path], file: Path) -> CaptureError:
+    wanted = ", ".join(each[0] for each in names[:3]) + (", ..." if len(names) > 3 else "")
+    have = f"holds {len(images)} others ({', '.join(list(images)[:3])}, ...)" if images else "holds no photographs"
+    return CaptureError(
+        f"{file}: none of its {len(names)} photographs is in {folder}, which {have}. It names {wanted}. Say which "
+        "folder they are in: --images FOLDER"
+    )
+
+
+def _refuse_shared(found: Sequence[str | None], file: Path) -> None:
+    """Raise `CaptureError` for photographs that were found for several cameras."""
     twice = sorted(name for name, count in Counter(filter(None, found)).items() if count > 1)
     if twice:
         raise CaptureError(
             f"{file}: several of its cameras mean the same photograph: {', '.join(twice[:10])}. Photographs of one "
             "name need their folders, on disk and in the project: give the folder above them with --images."
         )
-    notes = [f"{len(unclear)} names of the project may be of several photographs in {folder}, and are taken for none "
-             f"({_either(unclear[:10])})."] if unclear else []  # fmt: skip
-    chosen = [name for name, each in zip(found, meant, strict=True) if name is not None and len(each) > 1]
+
+
+def _notes_on_several(unclear: Sequence[Sequence[str]], chosen: Sequence[str], folder: Path) -> tuple[str, ...]:
+    """What to say of names that may be of several photographs: those of none, and those chosen by their size."""
+    several = f"names of the project may be of several photographs in {folder}"
+    notes = [f"{len(unclear)} {several}, and are taken for none ({_either(unclear[:10])})."] if unclear else []
     if chosen:
         notes.append(
-            f"{len(chosen)} names of the project may be of several photographs in {folder}; those are taken that are "
-            f"as large as the cameras ({', '.join(chosen[:10])})."
+            f"{len(chosen)} {several}; those are taken that are as large as the cameras ({', '.join(chosen[:10])})."
         )
-    called = [name or _plain(each[0]) for name, each in zip(found, names, strict=True)]
-    paths = tuple(images.get(name, folder / name) for name in called)
-    return FoundPhotographs(relative, tuple(called), paths, tuple(notes))
+    return tuple(notes)
 
 
 def _of_size(names: Sequence[str], size: tuple[int, int], images: dict[str, Path]) -> str | None:
