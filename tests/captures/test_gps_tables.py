@@ -331,6 +331,11 @@ def test_rows_without_names_of_columns_have_accuracies_behind_three_angles(tmp_p
     assert read_gps_table(tmp_path / "t.csv").rows[0].gps_std == (0.02, 0.04)
 
 
+def test_a_row_that_lacks_a_longitude_exchanges_nothing(tmp_path):
+    (tmp_path / "t.csv").write_text("a.jpg,-33.5,-120.6,500\nb.jpg,-33.5\nc.jpg,-33.5,-120.6,500\n")
+    assert [row.position for row in read_gps_table(tmp_path / "t.csv").rows] == [(-33.5, -120.6, 500)] * 2
+
+
 def test_moments_of_a_drone_are_matched_by_number(tmp_path):
     seen = small_photographs(tmp_path, [f"DJI_2026_{k:04d}_V.jpg" for k in range(1, 5)])
     file = tmp_path / "flight.MRK"

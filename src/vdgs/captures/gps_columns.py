@@ -163,19 +163,19 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
         order |= {"across": 7, "upwards": 8}
     if system is not None:
         return Columns({**order, "x": 1, "y": 2}, system)
-    values = [number_of(row.words[k]) for row in rows for k in (1, 2) if len(row.words) > k]
-    largest = [np.abs(np.array(each, float)).max(initial=0) for each in (values[::2], values[1::2])]
+    places = [[number_of(word) for word in row.words[1:3]] for row in rows if len(row.words) > 2]
+    largest = np.abs(np.array(places, float).reshape(-1, 2)).max(axis=0, initial=0)
     if max(largest) > 180:
         raise CaptureError(
             f"{file}: names neither its columns nor the coordinate system of values such as {words[1]}, "
             f"{words[2]}. Write its code as a first line of its own, such as EPSG:32633."
         )
     swapped = largest[0] > 90
-    places = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
+    where = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
     read = f"name, {'longitude, latitude' if swapped else 'latitude, longitude'}, altitude"
     more = ", ..., accuracies across and up" if "across" in order else ""
     note = "" if swapped and not more else f"names no columns; read as {read}{more}."
-    return Columns({**order, **places}, None, note=note)
+    return Columns({**order, **where}, None, note=note)
 
 
 def _is_datum(system: str, file: Path) -> bool:
