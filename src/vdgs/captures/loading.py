@@ -60,7 +60,9 @@ def read_files(root: Path, options: CaptureOptions) -> SourceCapture:
         what, archive = (
             ("is a file", " (of an archive, once it is unpacked)") if root.is_file() else ("no such folder", "")
         )
-        raise CaptureError(f"{root}: {what}. Give the folder that holds images/ and sparse/{archive}.")
+        raise CaptureError(
+            f"{root}: {what}. Give the folder of the photographs, or one that holds images/ and sparse/{archive}."
+        )
     _check_options(root, options)
     return read_source(root, options)
 

@@ -107,7 +107,14 @@ class ConfigFile:
         try:
             return _parse_settings(self.path, self.path.read_text(encoding="utf-8-sig"))
         except UnicodeDecodeError as error:
-            raise RunError(f"{self.path}: is damaged, not valid YAML ({yaml_fault(error)})") from error
+            raise _not_yaml(self.path, error) from error
+
+
+def _not_yaml(path: Path, error: Exception) -> RunError:
+    return RunError(
+        f"{path}: is damaged, not valid YAML ({yaml_fault(error)})\n"
+        "Correct what is wrong there, put a whole copy there, or begin another run: vdgs run CAPTURE --output RUN"
+    )
 
 
 @lru_cache(maxsize=4)
@@ -117,7 +124,7 @@ def _parse_settings(path: Path, text: str) -> RunSettings:
     try:
         settings = load_yaml(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise RunError(f"{path}: is damaged, not valid YAML ({yaml_fault(error)})") from error
+        raise _not_yaml(path, error) from error
     missing = [name for name in SECTIONS if not isinstance(settings, dict) or name not in settings]
     if missing:  # a part of a file may be YAML too: defaults in place of the rest would train another scene
         raise RunError(

@@ -1,0 +1,36 @@
+"""Versions: whatever an installation brings along is pinned, so that two fresh machines get the same."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+CONSTRAINTS = Path(__file__).parents[1] / "constraints.txt"
+
+
+def _brought_along(package: str, extras: frozenset[str], seen: set[tuple[str, frozenset[str]]]) -> None:
+    """Collect what a package needs on this machine, and what that needs; what is not installed here has no needs."""
+    name = canonicalize_name(package)
+    if (name, extras) in seen:
+        return
+    seen.add((name, extras))
+    try:
+        needs = map(Requirement, requires(name) or ())
+    except PackageNotFoundError:
+        return
+    for need in needs:
+        if need.marker is None or any(need.marker.evaluate({"extra": extra}) for extra in extras or {""}):
+            _brought_along(need.name, frozenset(need.extras), seen)
+
+
+def test_every_package_that_an_installation_brings_along_is_pinned():
+    seen = set[tuple[str, frozenset[str]]]()
+    _brought_along("vdgs", frozenset({"test", "demo"}), seen)
+    pinned = {canonicalize_name(name) for name in re.findall(r"^([\w.-]+)==", CONSTRAINTS.read_text(), re.MULTILINE)}
+    needed = {name for name, _ in seen} - {"vdgs"}
+    assert {"torch", "scikit-learn", "joblib"} <= needed  # the walk went somewhere
+    assert needed - pinned == set()
