@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 from rich.console import Console
 
+from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.merging import merge_blocks
 from vdgs.runs.model_integrity import load_verified
-from vdgs.runs.open_run import all_block_view_indices, load_run_blocks
+from vdgs.runs.open_run import OpenedRun, all_block_view_indices, load_run_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
@@ -43,10 +46,8 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         reset_peak_memory()
         start = time.monotonic()
         opened = context.open_model("coarse")
-        views, coarse = opened.capture.train_views, opened.model
-        if run.method().merge.reference_exposure == "local":  # of a version that gave the coarse model none?
-            with show_share(console, "colors of the photographs") as on_progress:
-                coarse = with_local_exposure(coarse, [view.camera for view in views], on_progress)
+        coarse = _with_reference_exposure(opened, run.method(), console)
+        views = opened.capture.train_views
         cameras = [[views[i].camera for i in indices] for indices in all_block_view_indices(run, opened.capture)]
         trained = [
             partial(load_verified, folder, keys.blocks, index) if done[index] else None
@@ -59,12 +60,9 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         merged = replace(merged, metadata=replace(merged.metadata, key=keys.merge))
         merged.save(run.merged.model)
         stages = [opened.status, *(folder.status() for folder, is_done in zip(folders, done, strict=True) if is_done)]
-        status = StatusRecord(
-            state="done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(merged_blocks),
+        status = replace(
+            _of_stages(stages), anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(merged_blocks),
             block_models=tuple(models), model_id=file_id(run.merged.model),
-            seconds=sum(each.seconds or 0.0 for each in stages),
-            iterations=sum(each.iteration or 0 for each in stages),
-            peak_memory_bytes=max(each.peak_memory_bytes or 0 for each in stages),
             merge_seconds=time.monotonic() - start, merge_peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
         run.merged.set_status(status)
@@ -72,6 +70,25 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         f"merged {sum(done)} of {len(blocks)} blocks: {len(coarse.anchors):,} coarse anchors became "
         f"{len(merged.anchors):,}\nmodel: {run.merged.model}",
         highlight=False,
+    )
+
+
+def _with_reference_exposure(opened: OpenedRun, method: MethodConfig, console: Console) -> AnchorModel:
+    """The coarse model, with the exposure of each place where the merged one has it and a coarse model of another
+    version may not."""
+    if method.merge.reference_exposure != "local":
+        return opened.model
+    with show_share(console, "colors of the photographs") as on_progress:
+        return with_local_exposure(opened.model, [view.camera for view in opened.capture.train_views], on_progress)
+
+
+def _of_stages(stages: Sequence[StatusRecord]) -> StatusRecord:
+    """What a merged model took: the sums of its stages, and the memory of the largest."""
+    return StatusRecord(
+        state="done",
+        seconds=sum(each.seconds or 0.0 for each in stages),
+        iterations=sum(each.iteration or 0 for each in stages),
+        peak_memory_bytes=max(each.peak_memory_bytes or 0 for each in stages),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -151,21 +152,30 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     if width is None or height is None:
         header = read_header(image)
         width, height = told_size((header.width, header.height), (get("cx"), get("cy")), file, image.name, _WRITE_SIZE)
-    fx = get("fl_x", _focal(width, get("camera_angle_x")))
-    fy = get("fl_y", fx if get("fl_x") is not None else _focal(height, get("camera_angle_y")))
-    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-    if fx is None or fy is None:
-        given = {key: get(key) for key in ("camera_angle_x", "camera_angle_y") if get(key) is not None}
-        wrong = f": {' and '.join(f'{key} {angle:g}' for key, angle in given.items())} must be radians, below pi"
-        raise CaptureError(
-            f"{file}: no focal length for {image.name} (fl_x or camera_angle_x{wrong if given else ''})."
-        )
+    fx, fy = _focals(get, (width, height), file, image.name)
     # A corner is no principal point: programs that know none write 0.
     head = (fx, fy, get("cx", width / 2) or width / 2, get("cy", height / 2) or height / 2)
     model, tail = _lens(_camera_model(values, file), _distortion(values, file), file)
     if not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
+
+
+def _focals(
+    get: Callable[[str], float | None], size: tuple[float, float], file: Path, label: str
+) -> tuple[float, float]:
+    """Focal lengths in pixels along x and y, each the other's where only one is given. Raises CaptureError."""
+    angles = {key: get(key) for key in ("camera_angle_x", "camera_angle_y")}
+    across, down = (_focal(side, angle) for side, angle in zip(size, angles.values(), strict=True))
+    fl_x, fl_y = get("fl_x"), get("fl_y")
+    fx = across if fl_x is None else fl_x
+    fy = fl_y if fl_y is not None else fx if fl_x is not None else down
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None:
+        given = " and ".join(f"{key} {angle:g}" for key, angle in angles.items() if angle is not None)
+        wrong = f": {given} must be radians, below pi" if given else ""
+        raise CaptureError(f"{file}: no focal length for {label} (fl_x or camera_angle_x{wrong}).")
+    return fx, fy
 
 
 def told_size(
