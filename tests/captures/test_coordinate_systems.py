@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,57 @@ def test_units_of_the_columns_of_x_and_y_count(tmp_path, system, names, factors)
     named.write_text(f"EPSG:4326\n{names}\na.jpg,0.01,0.02,5\n")
     with pytest.raises(CaptureError, match="unit of length, but EPSG:4326 counts in degrees"):
         read_gps_table(named)
+
+
+@pytest.mark.parametrize(
+    ("system", "metres"),
+    [("EPSG:2263", 1200 / 3937), ("EPSG:2277+6360", 1200 / 3937), ("+proj=utm +zone=19 +south +units=km", 1000)],
+)
+@pytest.mark.parametrize("heading", ["x ({}),y ({})", "Easting_{},Northing_{}", "E [{}],N [{}]"])
+def test_columns_that_say_metres_are_metres_under_any_system(tmp_path, system, metres, heading):
+    own = np.array([EASTING, NORTHING]) / 1000 if metres == 1000 else np.array([1_000_000.0, 200_000])
+    read = []
+    for names, given in (("x,y", own), (heading.format("m", "m"), own * metres)):
+        x, y = map(repr, given.tolist())
+        (tmp_path / "t.csv").write_text(f"{system}\nname,{names},z (m)\na.jpg,{x},{y},80\n")
+        read.append(read_gps_table(tmp_path / "t.csv"))
+    places = [table.rows[0].position for table in read]
+    assert places[1] == pytest.approx(places[0], abs=1e-9)
+    assert not any("feet" in note for note in read[1].notes)
+
+
+def test_metres_of_a_law_are_those_of_the_system_and_of_degrees_none(tmp_path):
+    for system, place in (("EPSG:29371", "100000,-2500000"), ("EPSG:4258", "11.5,48.1")):  # German legal metres
+        places = []
+        for names in ("x,y", "x [m],y [m]"):
+            (tmp_path / "t.csv").write_text(f"{system}\nname,{names},z\na.jpg,{place},80\n")
+            places.append(read_gps_table(tmp_path / "t.csv").rows[0].position)
+        assert places[0] == places[1]
+
+
+@pytest.mark.parametrize("system", ["EPSG:5555", "EPSG:25832+5783", "EPSG:25832+5621", "EPSG:3067+3900"])
+def test_heights_above_a_geoid_that_proj_has_no_grid_of_at_all_are_told(tmp_path, system):
+    _, name = to_geodetic(system, tmp_path)
+    assert name.endswith("heights as they are, for PROJ lacks the grid of their geoid")
+
+
+@pytest.mark.parametrize(
+    ("system", "x", "y", "said"),
+    [
+        ("Amersfoort / RD New", 686104, 5330412, "lie 4,4.. km outside of the area that Amersfoort / RD New is made"),
+        ("EPSG:2053", -9998, -2889000, "km outside of .* the right signs"),
+        ("EPSG:2053", 9998, 2889000, ""),
+        ("EPSG:25832", 950000, 5400000, ""),  # one zone for a country
+        ("EPSG:25833", 970000, 7800000, ""),
+        ("EPSG:3857", 1200000, 6000000, ""),
+    ],
+)
+def test_places_far_outside_of_their_system_are_told(tmp_path, system, x, y, said):
+    (tmp_path / "geo.txt").write_text(f"{system}\na.jpg {x} {y} 500\nb.jpg {x + 30} {y} 500\n")
+    notes = " ".join(read_gps_table(tmp_path / "geo.txt").notes)
+    assert bool(re.search("outside of", notes)) is bool(said)
+    assert re.search(said, notes)
+    assert "may be off by 50 m" not in notes
 
 
 @pytest.mark.parametrize("words", ["600", "600 ft", "182.88 m"])

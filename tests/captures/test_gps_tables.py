@@ -25,6 +25,9 @@ TABLES = {
     "semicolons": "name;lat;lon;alt\na.jpg;-33.5;-70.6;500\n",
     "decimal commas": "name;lat;lon;alt\na.jpg;-33,5;-70,6;500,0\n",
     "tabs": "name\tlatitude\tlongitude\taltitude\na.jpg\t-33.5\t-70.6\t500\n",
+    "blanks and decimal commas": "name lat lon alt\na.jpg -33,5 -70,6 500,0\n",
+    "blanks and decimal commas, utm": f"EPSG:32719\na.jpg {EASTING} {NORTHING} 500,0\n".replace(".7", ",7"),
+    "blanks and decimal commas, no names": "a.jpg -33,5 -70,6 500,0 5,0 10,0\n",
     "columns of blanks": "name   lat     lon   alt\na.jpg  -33.5  -70.6  500\n",
     "another order": "alt,lon,lat,File Name\n500,-70.6,-33.5,a.jpg\n",
     "odm": "EPSG:4326\na.jpg -70.6 -33.5 500\n",
@@ -208,6 +211,20 @@ def test_rows_that_are_there_twice_are_of_photographs_that_are_there(tmp_path):
     assert not found.are_stated.any()
     assert len(found) == len(NAMES)
     assert not any("not there" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("north_m", "accuracy", "said"),
+    [(3, "", ""), (100, "", "lie 100 m from those in the photographs"), (60, "", "lie 60 m"), (60, "80", "")],
+)
+def test_a_table_beside_the_positions_of_the_photographs_says_how_far(tmp_path, north_m, accuracy, said):
+    taken = small_photographs(tmp_path, NAMES)
+    seen = [replace(photo, lat_lon=(-33.5 - k / 1000, -70.6)) for k, photo in enumerate(taken)]
+    rows = [f"{k}.jpg,{-33.5 - k / 1000 + north_m / 110_910:.9f},-70.6,500,{accuracy},{accuracy}\n" for k in range(4)]
+    (file := tmp_path / "gps.csv").write_text("name,lat,lon,alt,hacc,vacc\n" + "".join(rows))
+    notes = " ".join(read_gps_priors(seen, file, (1.0, 2.0)).notes)
+    assert ("from those in the photographs" in notes) is bool(said)
+    assert said in notes
 
 
 @pytest.mark.parametrize(
@@ -401,7 +418,11 @@ def test_columns_that_are_no_minutes_of_the_angles_that_are_read(tmp_path, heade
         ("altitude(m above ground),elevation(m ASL)", "60,500"), ("height (agl),height (msl)", "60,500"),
         ("geoid height,height", "30,500"), ("geoid height,ellipsoidal height", "30,500"),
         ("Altitud (pies)", "1640.41995"), ("Höhe (Fuß)", "1640.41995"), ("Altitude (pieds)", "1640.41995"),
-        ("高度(英尺)", "1640.41995"), ("alt (')", "1640.41995"), ("alt", "1640.41995 pies"), ("alt", "500 m ü. NN"),
+        ("高度(英尺)", "1640.41995"), ("alt (')", "1640.41995"),
+        ("alt (International Feet)", "1640.41995"), ("alt (ift)", "1640.41995"), ("elev_ift", "1640.41995"),
+        ("z (intl. ft)", "1640.41995"), ("z (sft)", "1640.416667"), ("alt (US ft)", "1640.416667"),
+        ("Elevation (U.S. Survey Feet)", "1640.416667"), ("alt_usft", "1640.416667"),
+        ("alt", "1640.41995 pies"), ("alt", "500 m ü. NN"),
     ],
 )  # fmt: skip
 def test_altitudes_are_known_by_what_their_headings_mean(tmp_path, columns, values):

@@ -125,6 +125,38 @@ def test_lists_that_a_spreadsheet_wrote_are_read(flight, tmp_path):
     assert places[0] == pytest.approx(places[1], abs=1e-6)
 
 
+def test_a_system_in_a_comment_and_decimal_commas_between_blanks_are_read(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    file.write_text(plain := listed(flight))
+    sound = read_gcp_list(file, collection, ())
+    head, *lines = plain.splitlines()
+    commas = [" ".join([*" ".join(line.split()[:5]).replace(".", ",").split(), *line.split()[5:]]) for line in lines]
+    for rows in (["# of May", f"#{head}", *lines], ["# EPSG:4326", head, *lines], [head, *commas]):
+        file.write_text("\n".join(rows))
+        assert read_gcp_list(file, collection, ()).points == sound.points
+
+
+def test_points_without_a_name_take_none_of_another(flight, tmp_path):
+    text = listed(flight, *({"name": name} for name in ("", "", "Point~1", "Point~1", "", "")))
+    (file := tmp_path / "gcp_list.txt").write_text(text.replace(" ", "\t").replace("~", " "))
+    collection = collect_images([flight.folder])
+    points = read_gcp_list(file, collection, ("all",)).points
+    assert [point.name for point in points] == ["point 4", "Point 1", "point 3"]
+
+
+def test_metres_under_a_system_in_feet_are_metres(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    marks, found = [(k, name) for k in range(3) for name in flight.names[:2]], []
+    for unit, metres in (("ft", 1.0), ("m", 1200 / 3937)):
+        places = [((1e6 + 100 * k) * metres, (2e5 + 50 * k**2) * metres) for k, _ in marks]
+        rows = [f"{x!r},{y!r},30,9,9,{name},{k}" for (x, y), (k, name) in zip(places, marks, strict=True)]
+        file.write_text("\n".join(["EPSG:2263", f"x ({unit}),y ({unit}),z (m),px,py,photograph,name", *rows]))
+        found.append(read_gcp_list(file, collection, ("all",)))
+    one, other = (np.array([point.geodetic for point in each.points]) for each in found)
+    assert other == pytest.approx(one, abs=1e-9)
+    assert "feet" not in found[1].crs
+
+
 @pytest.mark.parametrize(("heading", "height"), [("z (ft)", 600), ("z", 600), ("z [m]", 182.88)])
 def test_heights_of_a_system_in_feet_are_converted_once(flight, tmp_path, heading, height):
     collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"

@@ -451,6 +451,15 @@ def test_the_look_says_what_the_flight_is(tmp_path):
     assert found.days == ["2026-06-01"]
 
 
+def test_positions_of_few_photographs_tell_no_overlap(tmp_path):
+    seen = flight(tmp_path, 9)
+    some = [replace(photo, lat_lon=photo.lat_lon if k % 3 == 0 else None) for k, photo in enumerate(seen)]
+    found = make_preflight_report(collect_images([tmp_path]), positions_of(some))
+    assert found.positions == 3
+    assert found.forward_overlap is found.views_per_point is None
+    assert not any("overlap" in each or "is seen by" in each for each in found.warnings)
+
+
 def test_other_days_and_small_files_are_remarked(tmp_path):
     seen = flight(tmp_path)
     kept = collect_images([tmp_path])

@@ -14,7 +14,7 @@ from typing import NamedTuple
 QUANTITIES = ("altitude", "elevation", "height")
 DATUMS = frozenset({"sea", "ellipsoid", "ground", "undulation"})
 #: Units: metres in one, or degrees in one.
-LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "us": 1200 / 3937}
+LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "sft": 1200 / 3937, "us": 1200 / 3937}
 ANGLES = {"deg": 1.0, "rad": 57.29577951308232, "gon": 0.9}
 #: English, German, Spanish, French, Italian, Portuguese and Chinese; without accents and blanks.
 _WORDS = {
@@ -40,12 +40,13 @@ _WORDS = {
         "mm": "mm millimeter millimeters millimetre millimetres milimetros millimetri 毫米",
         "cm": "cm centimeter centimeters centimetre centimetres zentimeter centimetros centimetri 厘米",
         "km": "km kilometer kilometers kilometre kilometres kilometros chilometri 公里 千米",
-        "ft": "ft feet foot fuss fuß pie pies pied pieds piede piedi 英尺",
+        "ft": "ft ift feet foot fuss fuß pie pies pied pieds piede piedi 英尺",
+        "sft": "sft",
         "us": "us survey ussurvey",
         "deg": "deg degree degrees grad grados grado degres degre gradi graus 度",
         "rad": "rad radian radians radianes radianti radianten radiant 弧度",
         "gon": "gon gons grads gradian gradians grade grades",
-        "format": "dd decimal decimals decimales dezimal decimali dms",
+        "format": "dd decimal decimals decimales dezimal decimali dms int intl international",
         "": "gps gnss rtk camera drone uav photo above over below under level mean the of from and to at uber ub u auf "
         "sobre sob sopra el la le lo il del de da do du dela au dessus audessus nivel niveau livello sul dal al "
         "超 以上 以 上 的 面 点 距",
@@ -82,10 +83,15 @@ class Heading(NamedTuple):
 
     @property
     def meters(self) -> float:
-        """Metres in one of its values."""
+        """Metres in one of its values; 1 where it names no length."""
+        return 1.0 if self.told_meters is None else self.told_meters
+
+    @property
+    def told_meters(self) -> float | None:
+        """Metres in one of its values; None where it names no length."""
         if "us" in self.units and "ft" in self.units:
             return LENGTHS["us"]
-        return next((LENGTHS[each] for each in self.units if each in LENGTHS and each != "us"), 1.0)
+        return next((LENGTHS[each] for each in self.units if each in LENGTHS and each != "us"), None)
 
     @property
     def degrees(self) -> float | None:

@@ -15,7 +15,14 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.errors import CaptureError
-from vdgs.geometry.datum_operation import DatumOperation, NoOperation, is_near_wgs84, operation_at
+from vdgs.geometry.datum_operation import (
+    DatumOperation,
+    NoOperation,
+    is_ballpark,
+    is_near_wgs84,
+    meters_outside,
+    operation_at,
+)
 from vdgs.geometry.geodesy import geodetic_from_ecef, median_place
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
@@ -50,6 +57,10 @@ UNKNOWN_DATUM_M = 300.0
 ELSEWHERE_M = 50.0
 #: A datum that moves places by less (degrees) is WGS 84 for PROJ.
 _SAME_DEG = 1e-8
+#: Units that differ by less (share) are one: feet and metres of one system are of the survey, of a law, or not.
+_SAME_UNIT = 5e-5
+#: Systems are used so far outside of the area that they are made for (metres): a zone for a whole country (choice).
+OUTSIDE_M = 600_000.0
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
 _GLOBAL = {"WGS 84", "GRS 1980"}
 #: ODM's words for the zones of UTM, and those that people write in their place.
@@ -282,7 +293,7 @@ def _is_exchanged(crs: Any, change: Callable[..., tuple[Any, ...]], x: np.ndarra
     there as they are."""
     if not crs.is_projected or not len(x):
         return False
-    area = next((part.area_of_use for part in (crs, *crs.sub_crs_list) if part.area_of_use is not None), None)
+    area = _area_of(crs)
     if area is None or area.west > area.east:
         return False
 
@@ -322,6 +333,8 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
             f"taken as of WGS 84, for PROJ knows no shift from {datum.name} there (may be off by "
             f"{UNKNOWN_DATUM_M:.0f} m)"
         )
+    if way.made_for and outside_area(header, geodetic):  # which says more
+        return UNKNOWN_DATUM_M, ""
     if way.made_for:
         return ELSEWHERE_M, (
             f"converted from {datum.name} to WGS 84 by a shift that is made for "
@@ -334,6 +347,29 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
     if moved < _SAME_DEG or way.accuracy_m == 0:
         return 0.0, ""
     return way.accuracy_m, f"converted from {datum.name} to WGS 84, good to {way.accuracy_m:.2g} m"
+
+
+def outside_area(header: str, geodetic: Float[np.ndarray, "n 3"]) -> list[str]:
+    """What to say of places (latitude, longitude, height) that lie far from where their system is used."""
+    import pyproj
+
+    crs = pyproj.CRS.from_user_input(_named(header))
+    area = _area_of(crs)
+    if area is None or not len(geodetic):
+        return []
+    away = meters_outside(area, *median_place(geodetic)[:2])
+    if away < OUTSIDE_M:
+        return []
+    where = shorten(area.name.rstrip("."), 60, placeholder=" ...")
+    return [
+        f"its places lie {away / 1000:,.0f} km outside of the area that {crs.name} is made for ({where}), and are "
+        "used all the same. Is it the right system, and have x (east) and y (north) the right signs?"
+    ]
+
+
+def _area_of(crs: Any) -> Any | None:
+    """The area that a system is made for, or of several parts the first that names one."""
+    return next((part.area_of_use for part in (crs, *crs.sub_crs_list) if part.area_of_use is not None), None)
 
 
 def _horizontal(crs: Any) -> Any:
@@ -350,13 +386,14 @@ def look_like_degrees(places: np.ndarray) -> bool:
 
 @cache
 def _has_grids(crs: Any) -> bool:
-    """Whether the best way from a system with heights above a geoid to those above the ellipsoid is at hand. PROJ looks
-    seconds for it, and a table asks several times."""
+    """Whether the best way from a system with heights above a geoid to those above the ellipsoid is at hand; of some
+    geoids PROJ knows no grid at all. PROJ looks seconds for it, and a table asks several times."""
     import pyproj
 
     with warnings.catch_warnings():  # said in words instead
         warnings.simplefilter("ignore", UserWarning)
-        return bool(pyproj.transformer.TransformerGroup(crs, "EPSG:4979", always_xy=True).best_available)
+        group = pyproj.transformer.TransformerGroup(crs, "EPSG:4979", always_xy=True)
+    return bool(group.best_available) and not all(map(is_ballpark, group.transformers))
 
 
 def is_local_system(name: str) -> bool:
@@ -371,18 +408,27 @@ def is_in_degrees(header: str) -> bool:
     return bool(pyproj.CRS.from_user_input(_named(header)).is_geographic)
 
 
-def in_units_of(header: str, meters: float, file: Path) -> float:
+def in_units_of(header: str, meters: float | None, file: Path) -> float:
     """Units of x and y of a system that `to_geodetic` knows in one of a column whose name says so many `meters`; 1 for
-    a column that says metres, or nothing. Raises CaptureError for a system in degrees."""
-    if meters == 1:
+    a column that says nothing (None). Raises CaptureError for a system in degrees, but of metres: programs write these
+    behind the names of x and y whatever they are."""
+    if meters is None:
         return 1.0
     import pyproj
 
-    axis = pyproj.CRS.from_user_input(_named(header)).axis_info[0]
-    if axis.unit_name.startswith("deg"):
+    crs = pyproj.CRS.from_user_input(_named(header))
+    if _horizontal(crs).is_geographic:
+        if meters == 1:
+            return 1.0
         raise CaptureError(f"{file}: its columns name a unit of length, but {header[:60]} counts in degrees.")
-    factor = meters / float(axis.unit_conversion_factor)
-    return 1.0 if abs(factor - 1) < 1e-5 else factor  # feet, of the survey or not, are those of the system
+    factor = meters / float(crs.axis_info[0].unit_conversion_factor)
+    return 1.0 if abs(factor - 1) < _SAME_UNIT else factor
+
+
+def named_in_units(system: str, across: Sequence[float | None], up: float | None) -> str:
+    """The name of a system by `to_geodetic` without what is assumed of feet, where headings say (metres in one) another
+    unit of heights than metres, or metres of x and y."""
+    return system.removesuffix(HEIGHTS_IN_METERS) if up not in (None, 1) or 1 in across else system
 
 
 def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:

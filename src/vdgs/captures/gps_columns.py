@@ -53,8 +53,8 @@ class Columns(NamedTuple):
     """Names of the columns of altitudes: the one that is read, and those that are not."""
     deviation_units: Mapping[str, float] = MappingProxyType({})
     """Metres in one of each of its accuracies, NaN for angles."""
-    across_units: tuple[float, float] = (1.0, 1.0)
-    """Metres (of angles degrees) in one of x and of y where their names say another unit, as `[km]`; 1 elsewhere."""
+    across_units: tuple[float | None, float | None] = (None, None)
+    """Metres (of angles degrees) in one of x and of y; None where their names say no unit: then it is the system's."""
     angles: Mapping[str, Heading] = MappingProxyType({})
     """The headings of latitudes and longitudes."""
     o_side: str = ""
@@ -115,10 +115,9 @@ def _described(words: Sequence[str], known: dict[str, int]) -> Columns:
 def _with_angles(columns: Columns, words: Sequence[str], system: str | None, file: Path) -> Columns:
     """The columns of latitudes and longitudes, of `system` where that is of another datum than WGS 84."""
     angles = {what: read_heading(words[columns.where[what]]) for what in ("lat", "lon")}
-    latitude, longitude = (1.0 if angle.degrees is None else angle.degrees for angle in angles.values())
     return columns._replace(
         system=system if system is not None and _is_datum(system, file) else None,
-        across_units=(latitude, longitude),
+        across_units=(angles["lat"].degrees, angles["lon"].degrees),
         angles=angles,
         o_side=west_or_east(words),
     )
@@ -141,7 +140,7 @@ def _with_plane(columns: Columns, rows: Sequence[Row], system: str | None, file:
             "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
             "give name,lat,lon,alt."
         )
-    return columns._replace(system=system, across_units=(meters_of(x), meters_of(y)))
+    return columns._replace(system=system, across_units=(told_meters(x), told_meters(y)))
 
 
 def _system_of_rows(rows: Sequence[Row], k: int, file: Path) -> str | None:

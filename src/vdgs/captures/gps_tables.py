@@ -18,13 +18,14 @@ import numpy as np
 from vdgs.captures.angles import degrees_of_text
 from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
 from vdgs.captures.coordinate_systems import (
-    HEIGHTS_IN_METERS,
     ToGeodetic,
     datum_error,
     height_unit,
     in_units_of,
     join_definition,
+    named_in_units,
     names_a_system,
+    outside_area,
     to_geodetic,
 )
 from vdgs.captures.gps_columns import BY_TIME, DEVIATIONS, Columns, read_columns
@@ -132,6 +133,7 @@ def read_gps_table(file: Path) -> GpsTable:
     datum_error_m, converted = 0.0, ""
     if columns.system is not None:
         datum_error_m, converted = datum_error(columns.system, np.array(positions))
+        notes += [f"{file.name}: {said}" for said in outside_area(columns.system, np.array(positions))]
     notes += [f"{file.name}: positions are {converted} (maps in that system lose nothing)."] if converted else []
     if len(placed) < len(rows):
         notes.append(f"{file.name}: {len(rows) - len(placed)} of {len(rows)} rows have no position; not used.")
@@ -174,8 +176,7 @@ def _height_notes(columns: Columns, system: str) -> list[str]:
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"altitudes are those of the column {read}, not of {', '.join(others)}.")
-    told = system if columns.altitude_unit in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
-    if doubt := told.partition("; ")[2]:
+    if doubt := named_in_units(system, columns.across_units, columns.altitude_unit).partition("; ")[2]:
         notes.append(f"{doubt}.")
     return notes
 
@@ -225,7 +226,10 @@ def _geodetic(rows: Sequence[Row], columns: Columns, file: Path) -> list[tuple[f
         if None in angles:
             words = [_word(row, columns, what) for what in ("lat", "lon", "alt")]
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
-        latitude, longitude = ((angle or 0.0) * unit for angle, unit in zip(angles, columns.across_units, strict=True))
+        latitude, longitude = (
+            (angle or 0.0) * (1.0 if unit is None else unit)
+            for angle, unit in zip(angles, columns.across_units, strict=True)
+        )
         position = (latitude, longitude, _altitude(row, columns, file))
         try:
             check_geodetic(position, file, f"line {row.number}: ")

@@ -248,9 +248,8 @@ def meters_of(word: str) -> float:
 
 
 def told_meters(word: str) -> float | None:
-    """The same of a heading that names a unit; None of one that names none."""
-    heading = read_heading(word)
-    return heading.meters if heading.units else None
+    """The same of a heading that names a length; None of one that names none."""
+    return read_heading(word).told_meters
 
 
 def number_of(word: str) -> float:

@@ -106,14 +106,27 @@ def rows_of(lines: Sequence[Line]) -> list[Row]:
             words = next(csv.reader([line.text], delimiter=separator, skipinitialspace=True))
         words = [word.strip().strip('"') for word in words]
         if separator != ",":
-            words = [word.replace(",", ".") if _DECIMAL_COMMA.fullmatch(word) else word for word in words]
+            words = with_decimal_points(words)
         rows.append(Row(line.number, words))
     return rows
+
+
+def with_decimal_points(words: Sequence[str]) -> list[str]:
+    """Words with a point for the decimal comma of those that are such numbers."""
+    return [word.replace(",", ".") if _DECIMAL_COMMA.fullmatch(word) else word for word in words]
 
 
 def separator_of(lines: Sequence[str]) -> str | None:
     """What parts the words of most lines into three or more; None for blanks."""
     for separator in _SEPARATORS:
         if sum(line.count(separator) >= 2 for line in lines) * 2 > len(lines):
-            return separator
+            return None if separator == "," and _has_decimal_commas_only(lines) else separator
     return None
+
+
+def _has_decimal_commas_only(lines: Sequence[str]) -> bool:
+    """Whether blanks part each line that has commas into three words or more, and commas stand in numbers alone."""
+    parted = [line.split() for line in lines if "," in line]
+    return all(
+        len(words) > 2 and all(_DECIMAL_COMMA.fullmatch(word) for word in words if "," in word) for words in parted
+    )

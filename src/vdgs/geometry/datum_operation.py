@@ -82,7 +82,7 @@ def _operation_at(crs: Any, latitude: float, longitude: float, own_axes: bool) -
     if not there and (by_hub := _by_hub(crs, latitude, longitude, own_axes)) is not None:
         known = (*known, by_hub)
         there = _usable([by_hub], latitude, longitude, own_axes)
-    made_for, shifts = "", [way for way in known if not _is_ballpark(way)]
+    made_for, shifts = "", [way for way in known if not is_ballpark(way)]
     if there:
         found = min(there, key=lambda way: (_accuracy(way), _off_center(way, latitude, longitude)))
     elif shifts:
@@ -95,7 +95,7 @@ def _operation_at(crs: Any, latitude: float, longitude: float, own_axes: bool) -
     needed = [way for way in better if _is_for(way, latitude, longitude) and _accuracy(way) < _accuracy(found)]
     grids = {grid.short_name for way in needed for grid in way.grids if not grid.available}
     return DatumOperation(
-        _transformer=found, latitude_first=own_axes, is_ballpark=_is_ballpark(found), made_for=made_for,
+        _transformer=found, latitude_first=own_axes, is_ballpark=is_ballpark(found), made_for=made_for,
         accuracy_m=_accuracy(found), missing_grids=tuple(sorted(grids)),
     )  # fmt: skip
 
@@ -144,7 +144,7 @@ def _by_hub(crs: Any, latitude: float, longitude: float, own_axes: bool) -> Any 
         found = ways.get_last_used_operation()
     except pyproj.exceptions.ProjError:
         return None
-    return None if _is_ballpark(found) else found
+    return None if is_ballpark(found) else found
 
 
 @lru_cache(maxsize=64)
@@ -160,13 +160,14 @@ def _usable(ways: Any, latitude: float, longitude: float, own_axes: bool) -> lis
     return [
         way
         for way in ways
-        if not _is_ballpark(way)
+        if not is_ballpark(way)
         and _is_for(way, latitude, longitude)
         and np.isfinite(way.transform(*place, 0.0)[:2]).all()
     ]
 
 
-def _is_ballpark(operation: Any) -> bool:
+def is_ballpark(operation: Any) -> bool:
+    """Whether an operation of PROJ leaves out the shift of a datum, or that of heights to a geoid."""
     return "ballpark" in operation.description.lower()
 
 
@@ -194,3 +195,15 @@ def is_inside(area: Any, latitude: float, longitude: float) -> bool:
     whole = abs(area.east - area.west) >= 360
     across = whole or (longitude - area.west) % 360 <= (area.east - area.west) % 360
     return bool(across and area.south <= latitude <= area.north)
+
+
+def meters_outside(area: Any, latitude: float, longitude: float) -> float:
+    """How far a place lies from the nearest one (nearly) in an area of use of PROJ, in metres; 0 inside."""
+    if is_inside(area, latitude, longitude):
+        return 0.0
+    north = min(max(latitude, area.south), area.north)
+    within = is_inside(area, north, longitude)
+    east = 0.0 if within else min(abs((longitude - edge + 180) % 360 - 180) for edge in (area.west, area.east))
+    one, other, apart = np.radians([latitude, north, east])
+    sines = np.sin((one - other) / 2) ** 2 + np.cos(one) * np.cos(other) * np.sin(apart / 2) ** 2
+    return float(2 * SEMI_MAJOR_M * np.arcsin(np.sqrt(min(sines, 1.0))))

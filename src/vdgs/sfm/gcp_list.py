@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -13,17 +14,19 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.coordinate_systems import (
-    HEIGHTS_IN_METERS,
     datum_error,
     height_unit,
     in_units_of,
     join_definition,
+    named_in_units,
+    names_a_system,
+    outside_area,
     to_geodetic,
 )
-from vdgs.captures.known_distances import MIN_OBSERVATIONS, text_lines
+from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.name_resolution import NameLookup, find_one
-from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, meters_of, number_of, told_meters
-from vdgs.captures.text_tables import Line, rows_of, separator_of
+from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, number_of, told_meters
+from vdgs.captures.text_tables import Line, read_lines, rows_of, separator_of, with_decimal_points
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear
@@ -145,7 +148,9 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
         is_check_point = ALL_POINTS in held_out or name in held_out or name.startswith(CHECK_PREFIX)
         points.append(GroundControlPoint(name, geodetic, seen, is_check_point))
     strange += [f"{file.name}: {said}" for said in _said_of_points(points, lines)]
-    error_m, converted = datum_error(header, np.array([point.geodetic for point in points]))
+    places = np.array([point.geodetic for point in points])
+    strange += [f"{file.name}: {said}" for said in outside_area(header, places)]
+    error_m, converted = datum_error(header, places)
     strange += [f"{file.name}: points are {converted}."] if converted else []
     return replace(_checked(points, system, file, strange), datum_error_m=error_m)
 
@@ -163,18 +168,24 @@ class _Listed(NamedTuple):
 def _listed(file: Path) -> _Listed:
     header, rows, (across, along, up) = _rows(file)
     transform, system = to_geodetic(header, file)
-    system = system if up in (None, 1) else system.removesuffix(HEIGHTS_IN_METERS)
+    system = named_in_units(system, (across, along), up)
     height = 1.0 if up is None else up / height_unit(header)
     units = in_units_of(header, across, file), in_units_of(header, along, file), height
     return _Listed(header, [_line(row, file, units) for row in rows], transform, system)
 
 
 def _by_point(found: Sequence[_Marked]) -> list[tuple[str, list[_Marked]]]:
-    """Names of points, and the lines of each: those of one name or, without names, of one place."""
+    """Names of points, and the lines of each: those of one name or, without names, of one place. Points without a name
+    are called by their number, or by a higher one where another point has that name."""
     groups: dict[tuple[object, ...], list[_Marked]] = {}
     for line, sighting in found:
         groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
-    return [(group[0][0].name or f"point {k}", group) for k, group in enumerate(groups.values(), 1)]
+    taken = {line.name.casefold() for line, _ in found}
+
+    def free(k: int) -> str:
+        return next(name for j in itertools.count(k, len(groups)) if (name := f"point {j}") not in taken)
+
+    return [(group[0][0].name or free(k), group) for k, group in enumerate(groups.values(), 1)]
 
 
 def _said_of_points(points: Sequence[GroundControlPoint], lines: Sequence[_Line]) -> list[str]:
@@ -250,23 +261,36 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
         )
 
 
-def _rows(file: Path) -> tuple[str, list[Row], tuple[float, float, float | None]]:
+def _rows(file: Path) -> tuple[str, list[Row], tuple[float | None, float | None, float | None]]:
     """The first line, and the words of the others, parted by blanks, or as in a CSV table; without names of columns, of
-    which the metres in one of x, y and z are given: of z only where its name says a unit."""
-    lines = [Line(*line) for line in text_lines(file, "control points")]
+    which the metres in one of x, y and z are given where they say a unit."""
+    lines = _lines_below_system(file)
     if not lines:
         raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
     _check_is_list([line.text for line in lines], file)
     text, count = join_definition([line.text for line in lines])
     header, lines = Line(lines[0].number, text), lines[count:]
     rows = [Row(line.number, line.text.split()) for line in lines]
-    if separator_of([line.text for line in lines]):
+    if separator_of([line.text for line in lines]) is None:
+        rows = [Row(number, [*with_decimal_points(words[:5]), *words[5:]]) for number, words in rows]
+    else:
         rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
     if not rows or any(map(_is_number, rows[0].words[:5])):
-        return header.text, rows, (1.0, 1.0, None)
+        return header.text, rows, (None, None, None)
     _check_order(rows[0], file)
     x, y, z = (rows[0].words + 3 * [""])[:3]
-    return header.text, rows[1:], (meters_of(x), meters_of(y), told_meters(z))
+    return header.text, rows[1:], (told_meters(x), told_meters(y), told_meters(z))
+
+
+def _lines_below_system(file: Path) -> list[Line]:
+    """The line that names the coordinate system, be it a comment where the first other line names none, and those below
+    it without comments."""
+    lines = [line._replace(text=line.text.strip()) for line in read_lines(file, "list of control points")]
+    body = [line for line in lines if not line.text.startswith("#")]
+    if not body or names_a_system(body[0].text):
+        return body
+    above = (line._replace(text=line.text.lstrip("# ")) for line in lines if line.number < body[0].number)
+    return [*itertools.islice((line for line in above if names_a_system(line.text)), 1), *body]
 
 
 def _check_is_list(lines: Sequence[str], file: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +24,9 @@ SAME_FLIGHT_DEG = 0.05
 #: Altitudes of a table that lie so far from those of the photographs (metres) are told: as far as a datum is off in few
 #: places, and nearer than heights over the ground are to those over the sea (choice).
 TOLD_ALTITUDE_M = 20.0
+#: And positions that lie so far from them across (metres), or farther than both are stated to be good to (choice: more
+#: than a receiver without corrections is off).
+TOLD_OFFSET_M = 20.0
 #: What altitudes are measured from where none is known.
 ALTITUDE_UNKNOWN = "not recorded; 0 is that of the median point"
 #: What altitudes may be rounded to (metres; feet among them), and from how many positions on that is told; their error
@@ -205,6 +209,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
         if not np.isfinite(row.position[2]):
             geodetic[index, 2], kinds[index] = _altitude_beside(photographs[index])
     notes = [*read.notes, *_unmatched(read.rows, rows, table), *_far_off(geodetic, photographs, table)]
+    notes += _beside(rows, photographs, table, read.datum_error_m)
     notes += _other_altitudes(rows, photographs, table)
     without = [index for index, row in rows.items() if not np.isfinite(row.position[2])]
     if without:
@@ -239,7 +244,7 @@ def _far_off(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: 
     def fits(places: np.ndarray) -> bool:
         return bool(np.abs(np.median(wrap_degrees(places - own), axis=0)).max() < SAME_FLIGHT_DEG)
 
-    if fits(given):
+    if fits(given):  # metres are `_beside`'s
         return []
     ways = {
         "latitude and longitude are exchanged": given[:, ::-1],
@@ -252,12 +257,48 @@ def _far_off(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: 
             f"{table}: {wrong}, as the positions in the photographs tell ({own[0][0]:.5f}, {own[0][1]:.5f}; here "
             f"{given[0][0]:.5f}, {given[0][1]:.5f}). Mend its columns or their names."
         )
-    places = np.append(given, np.zeros((len(given), 1)), axis=1)
-    away = np.linalg.norm(enu_from_geodetic(places, (own[0][0], own[0][1], 0.0)), axis=1)
+    away = _meters_apart(given, own)
     return [
         f"{table.name}: its positions lie {np.median(away) / 1000:,.0f} km from those in the photographs, and are used "
         "all the same. Another system or zone, or x and y exchanged?"
     ]
+
+
+def _beside(
+    rows: Mapping[int, GpsRow], photographs: Sequence[ImageMetadata], table: Path, datum_error_m: float
+) -> list[str]:
+    """What to say of a table of this flight whose positions lie farther from those in the photographs, in the median,
+    than both state (`datum_error_m` of the table's system among it)."""
+    pairs = [(row, photographs[index]) for index, row in rows.items() if photographs[index].lat_lon is not None]
+    if len(pairs) < MIN_POSITIONS:
+        return []
+    given, own = np.array([row.position[:2] for row, _ in pairs]), np.array([photo.lat_lon for _, photo in pairs])
+    if np.abs(np.median(wrap_degrees(given - own), axis=0)).max() >= SAME_FLIGHT_DEG:
+        return []
+    stated = [math.hypot(_stated_m(row, photo), datum_error_m, photo.datum_error_m) for row, photo in pairs]
+    away = float(np.median(_meters_apart(given, own)))
+    if away < max(TOLD_OFFSET_M, float(np.median(stated))):
+        return []
+    return [
+        f"{table.name}: its positions lie {away:,.0f} m from those in the photographs (median), and are used all the "
+        "same. Of another datum, or of other photographs?"
+    ]
+
+
+def _stated_m(row: GpsRow, photo: ImageMetadata) -> float:
+    """How far the positions of a row and of its photograph may lie apart across by what both state."""
+    own = max(photo.gps_std[:2]) if photo.gps_std is not None else photo.gps_error_m or 0.0
+    return math.hypot(row.gps_std[0] if row.gps_std is not None else 0.0, own)
+
+
+def _meters_apart(given: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Metres [n] between places and others [n, 2] in degrees, pair by pair."""
+    return np.array(
+        [
+            np.linalg.norm(enu_from_geodetic(np.array([[*place, 0.0]]), (*other, 0.0)))
+            for place, other in zip(given.tolist(), own.tolist(), strict=True)
+        ]
+    )
 
 
 def _other_altitudes(rows: Mapping[int, GpsRow], photographs: Sequence[ImageMetadata], table: Path) -> list[str]:

@@ -23,6 +23,8 @@ SMALL_FILE_RATIO = 0.4
 MIN_OVERLAP = 0.6
 #: A place should be seen by so many photographs (choice).
 MIN_VIEWS_PER_POINT = 4.0
+#: Where fewer photographs (share) have positions, the steps between these are not those of the flight (choice).
+MIN_POSITIONED = 0.9
 #: Positions whose stated error across is smaller (metres) were corrected, as they were taken or afterwards (choice).
 RTK_M = 0.2
 #: Views farther from straight down than this are oblique (degrees).
@@ -69,7 +71,9 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
     days = sorted({f"{when:%Y-%m-%d}" for when in _moments(photographs)})
     accuracies = [max(photo.gps_std[:2]) for photo in photographs if photo.gps_std is not None]
-    overlap, views = _overlap(photographs, positions, footprint), _views_per_place(positions, footprint)
+    # What positions tell of the flight needs those of nearly all photographs.
+    shown = footprint if len(positions) >= MIN_POSITIONED * len(photographs) else None
+    overlap, views = _overlap(photographs, positions, shown), _views_per_place(positions, shown)
     return PreflightReport(
         num_images=len(photographs),
         num_masks=sum(photo.mask is not None for photo in photographs),
