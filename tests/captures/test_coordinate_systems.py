@@ -7,14 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from vdgs.captures.coordinate_systems import (
-    datum_error,
-    false_origin,
-    geocentric_to_geodetic,
-    names_a_system,
-    to_geodetic,
-)
+from vdgs.captures.coordinate_systems import datum_error, false_origin, geocentric_to_geodetic, to_geodetic
 from vdgs.captures.gps_tables import read_gps_table
+from vdgs.captures.system_names import names_a_system
 from vdgs.errors import CaptureError
 
 PLACE = (-33.5, -70.6, 500.0)
@@ -265,7 +260,7 @@ def test_false_origins_are_those_of_the_systems():
 
 def test_names_of_files_are_not_looked_up_among_systems(monkeypatch):
     asked = []
-    monkeypatch.setattr("vdgs.captures.coordinate_systems._is_name", lambda words: bool(asked.append(words)))
+    monkeypatch.setattr("vdgs.captures.system_names._is_name", lambda words: bool(asked.append(words)))
     assert not any(names_a_system(line) for line in ("test_0001.jpg", "east/DJI_0001.JPG", "IMG_1.tiff"))
     assert not asked
     names_a_system("NAD83(2011) / Conus Albers")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.system_names import AROUND, pyproj_name
 from vdgs.errors import CaptureError
 from vdgs.geometry.datum_operation import (
     DatumOperation,
@@ -26,24 +27,10 @@ from vdgs.geometry.datum_operation import (
 from vdgs.geometry.geodesy import geodetic_from_ecef, median_place
 
 ToGeodetic = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
-_STARTS = re.compile(
-    r"(\d{4,6}$|(EPSG|ESRI|SRID)[\s:=_-]*\d+(?!\w|\.\w)|urn:ogc:def:crs:|https?://(www\.opengis\.net/(def/crs|gml/srs)|epsg\.io)/"
-    r"|WGS\s?84\b|(\w+ ?\d+[ /_]*)?UTM[\s_]*(zone[\s_:]*)?\d{1,2}[\s_]*(north|south|[A-Z])?(?!\w|\.\w)"
-    r"|\w[\w() +-]* / \w|\+proj=|\+init=|(GEOG|PROJ|GEO|PROJC|COMPD|COMPOUND)[A-Z]*CRS?\[|\w*CS\[)", re.I
-)  # fmt: skip
-#: Codes in whatever stands around them: `EPSG:32633+5773`, `EPSG=32633`, `UTM zone 33N (EPSG::32633)`, addresses.
-_CODES = re.compile(r"(?:EPSG|SRID)(?:\.io/|\.xml#|[\s:=_-]{0,3})(\d{4,6}(?:\+\d{4,6})?)(?!\d|\.)", re.I)
 #: What stands for a system of heights beside a code, and is no code.
 _UNKNOWN_HEIGHTS = re.compile(r"(?:EPSG|SRID)[\s:=_-]{0,3}\d{4,6}\+(?!\d)([^\s,;]+)$", re.I)
-_WKT = re.compile(r"\w*(CS|CRS)\[", re.I)
 #: Zones and national systems are used so far beside the area that they are made for (choice).
 BESIDE_DEG = 3.0
-#: A line that may be a name alone: no table of words, no numbers on their own.
-_WORDS = re.compile(r"(?!.*(^|\s)[\d.]+\s+[\d.])[A-Za-z][^,;\t]{2,60}")
-#: Lists of photographs begin so; PROJ looks half a second for a name that it does not know.
-_FILE_NAME = re.compile(r"\.[A-Za-z]{2,5}$")
-#: What may stand around a name: quotes, and the separators by which spreadsheets fill a line.
-_AROUND = " \t\r\n,;'\""
 #: Places that differ by less than this are of one flight in degrees, and one place in metres.
 _ONE_PLACE = 0.2
 #: What is said of systems in feet, where nothing says the unit of heights.
@@ -63,10 +50,6 @@ _SAME_UNIT = 5e-5
 OUTSIDE_M = 600_000.0
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
 _GLOBAL = {"WGS 84", "GRS 1980"}
-#: ODM's words for the zones of UTM, and those that people write in their place.
-#: A band of latitude may stand for the half: C to M is south, N to X north, but S alone says south.
-_UTM = re.compile(r"([A-Z]+ ?\d+)?[ /_]*UTM(?:[ _]ZONE)?[ _]*(\d{1,2})[ _]*(NORTH|SOUTH|[C-HJ-NP-X])", re.I)
-_LONGITUDE_LATITUDE = re.compile(r"WGS[ _]?84(?:[ _]+(?:long?[ _]?lat|lat[ _]?long?))?", re.I)
 
 
 class UnknownSystem(CaptureError):
@@ -75,37 +58,6 @@ class UnknownSystem(CaptureError):
     def __init__(self, message: str, definition: str) -> None:
         super().__init__(message)
         self.definition = definition
-
-
-def names_a_system(line: str) -> bool:
-    """Whether a line is the name of a coordinate system, as far as its beginning tells, or PROJ knows the whole."""
-    line = line.strip(_AROUND)
-    if _STARTS.match(line):
-        return True
-    return bool(_WORDS.fullmatch(line)) and not _FILE_NAME.search(line) and _is_name(line)
-
-
-@cache
-def _is_name(words: str) -> bool:
-    """Whether PROJ knows a projected system by these words: its name, that without the datum, or one of ESRI's."""
-    try:
-        import pyproj
-    except ImportError:
-        return False
-    try:
-        crs = pyproj.CRS.from_user_input(words)
-    except pyproj.exceptions.ProjError:
-        return False
-    given, known = (re.sub(r"[\W_]", "", each.lower()) for each in (words, crs.name))
-    return bool(crs.is_projected and (known.endswith(given) or words.count("_") > 2))
-
-
-def join_definition(lines: Sequence[str]) -> tuple[str, int]:
-    """The first line and, where it opens brackets (WKT), those up to where they are closed; and how many these are."""
-    text, count = (lines[0] if lines else ""), 1
-    while _WKT.match(text.strip(_AROUND)) and text.count("[") > text.count("]") and count < len(lines):
-        text, count = f"{text} {lines[count].strip()}", count + 1
-    return text, count
 
 
 def to_geodetic(
@@ -123,7 +75,7 @@ def to_geodetic(
         raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
     crs = None
     try:
-        crs = pyproj.CRS.from_user_input(_named(header))
+        crs = pyproj.CRS.from_user_input(pyproj_name(header))
         flat = len(crs.axis_info) == 2
         change = _to_latitude(crs, "EPSG:4326" if flat else "EPSG:4979", own_axes)
         up = _unit_without_heights(crs) if heights_as_xy else 1.0
@@ -167,7 +119,7 @@ def _name_of_system(crs: Any, header: str, heights_as_xy: bool) -> str:
     name = crs.name if crs.name != "unknown" else header
     if crs.is_compound and not _has_grids(crs):
         name += WITHOUT_GEOID
-    if heights := _UNKNOWN_HEIGHTS.match(header.strip(_AROUND)):
+    if heights := _UNKNOWN_HEIGHTS.match(header.strip(AROUND)):
         name += f"; heights as they are, for {heights[1]!r} is not known"
     unknown = crs.datum is not None and not _says_its_shift(crs) and crs.datum.name.lower().startswith("unknown")
     ellipsoid = crs.ellipsoid.name if unknown and crs.ellipsoid is not None else "WGS 84"
@@ -231,7 +183,7 @@ def unit_without_heights(header: str) -> float:
     systems."""
     import pyproj
 
-    return _unit_without_heights(pyproj.CRS.from_user_input(_named(header)))
+    return _unit_without_heights(pyproj.CRS.from_user_input(pyproj_name(header)))
 
 
 def _unit_without_heights(crs: Any) -> float:
@@ -245,7 +197,7 @@ def height_unit(header: str | None) -> float:
         return 1.0
     import pyproj
 
-    axes = pyproj.CRS.from_user_input(_named(header)).axis_info
+    axes = pyproj.CRS.from_user_input(pyproj_name(header)).axis_info
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
@@ -253,7 +205,7 @@ def has_heights(header: str) -> bool:
     """Whether a system that `to_geodetic` knows has heights of its own."""
     import pyproj
 
-    return len(pyproj.CRS.from_user_input(_named(header)).axis_info) > 2
+    return len(pyproj.CRS.from_user_input(pyproj_name(header)).axis_info) > 2
 
 
 def _to_latitude(crs: Any, target: str, own_axes: bool = False) -> Callable[..., tuple[Any, ...]]:
@@ -317,7 +269,7 @@ def datum_error(header: str, geodetic: Float[np.ndarray, "n 3"]) -> tuple[float,
     shifts that the header gives itself."""
     import pyproj
 
-    crs = pyproj.CRS.from_user_input(_named(header))
+    crs = pyproj.CRS.from_user_input(pyproj_name(header))
     if _says_its_shift(crs) or crs.geodetic_crs is None or not len(geodetic):
         return 0.0, ""
     datum = crs.geodetic_crs.to_2d()
@@ -353,7 +305,7 @@ def outside_area(header: str, geodetic: Float[np.ndarray, "n 3"]) -> list[str]:
     """What to say of places (latitude, longitude, height) that lie far from where their system is used."""
     import pyproj
 
-    crs = pyproj.CRS.from_user_input(_named(header))
+    crs = pyproj.CRS.from_user_input(pyproj_name(header))
     area = _area_of(crs)
     if area is None or not len(geodetic):
         return []
@@ -396,16 +348,11 @@ def _has_grids(crs: Any) -> bool:
     return bool(group.best_available) and not all(map(is_ballpark, group.transformers))
 
 
-def is_local_system(name: str) -> bool:
-    """Whether a system is one of a site, without a place on Earth."""
-    return bool(re.match(r"\s*(LOCAL|ENG(INEERING)?CRS|ENGCRS|\w*LOCAL_?CS)", name, re.I))
-
-
 def is_in_degrees(header: str) -> bool:
     """Whether a system that `to_geodetic` knows counts across in degrees."""
     import pyproj
 
-    return bool(pyproj.CRS.from_user_input(_named(header)).is_geographic)
+    return bool(pyproj.CRS.from_user_input(pyproj_name(header)).is_geographic)
 
 
 def in_units_of(header: str, meters: float | None, file: Path) -> float:
@@ -416,7 +363,7 @@ def in_units_of(header: str, meters: float | None, file: Path) -> float:
         return 1.0
     import pyproj
 
-    crs = pyproj.CRS.from_user_input(_named(header))
+    crs = pyproj.CRS.from_user_input(pyproj_name(header))
     if _horizontal(crs).is_geographic:
         if meters == 1:
             return 1.0
@@ -442,7 +389,7 @@ def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
     except ImportError:
         raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
     try:
-        crs = pyproj.CRS.from_user_input(_named(header))
+        crs = pyproj.CRS.from_user_input(pyproj_name(header))
         if (shift := _own_shift(crs)) is not None:
             return lambda places: geodetic_from_ecef(np.stack(shift.transform(*places.T), axis=1))
         datum = (crs.geodetic_crs or crs).datum
@@ -470,7 +417,7 @@ def false_origin(header: str) -> tuple[float, float]:
     """What a projected system adds to its eastings and northings, in its unit; 0, 0 for other systems."""
     import pyproj
 
-    crs = pyproj.CRS.from_user_input(_named(header))
+    crs = pyproj.CRS.from_user_input(pyproj_name(header))
     crs = _horizontal(crs)
     crs = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
     if not crs.is_projected or crs.coordinate_operation is None:
@@ -493,21 +440,3 @@ def _own_shift(crs: Any) -> Any | None:
         return None
     words = " ".join(f"+{name}={value}" for name, value in zip(_HELMERT, values, strict=False))
     return pyproj.Transformer.from_pipeline(f"+proj=helmert {words} +convention=position_vector")
-
-
-def _named(header: str) -> str:
-    """ODM's own words for systems, `WGS84`, `WGS84 longlat` and `WGS84 UTM 15N`, as codes; others as they are."""
-    header = re.sub(r"(?i)^(crs|srs)\s*:|\s#.*", "", header.strip(_AROUND)).strip()
-    codes = [] if "[" in header or header.startswith("+") else _CODES.findall(header)
-    if 0 < len(dict.fromkeys(codes)) < 3:
-        return f"EPSG:{'+'.join(dict.fromkeys(codes))}"
-    if _LONGITUDE_LATITUDE.fullmatch(header):
-        return "EPSG:4326"
-    zone = _UTM.fullmatch(header)
-    if zone is not None:
-        south = zone[3].upper() in ("SOUTH", *"CDEFGHJKLMS")
-        if zone[1] and not re.fullmatch(r"WGS[ _]?84", zone[1], re.I):
-            datum = re.sub(r"(?i)SIRGAS ?", "SIRGAS ", zone[1].upper())
-            return f"{datum} / UTM zone {int(zone[2])}{'S' if south else 'N'}"
-        return f"EPSG:{(32700 if south else 32600) + int(zone[2])}"
-    return re.sub(r"(?i)^(EPSG|ESRI)[\s:]+", r"\1:", header)

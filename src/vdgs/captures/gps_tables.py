@@ -22,13 +22,12 @@ from vdgs.captures.coordinate_systems import (
     datum_error,
     height_unit,
     in_units_of,
-    join_definition,
     named_in_units,
-    names_a_system,
     outside_area,
     to_geodetic,
 )
 from vdgs.captures.gps_columns import BY_TIME, DEVIATIONS, Columns, read_columns
+from vdgs.captures.system_names import join_definition, names_a_system
 from vdgs.captures.table_columns import (
     NO_DATA,
     UNKNOWN,

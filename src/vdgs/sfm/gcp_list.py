@@ -17,14 +17,13 @@ from vdgs.captures.coordinate_systems import (
     datum_error,
     height_unit,
     in_units_of,
-    join_definition,
     named_in_units,
-    names_a_system,
     outside_area,
     to_geodetic,
 )
 from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.name_resolution import NameLookup, find_one
+from vdgs.captures.system_names import join_definition, names_a_system
 from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, number_of, told_meters
 from vdgs.captures.text_tables import Line, read_lines, rows_of, separator_of, with_decimal_points
 from vdgs.errors import CaptureError

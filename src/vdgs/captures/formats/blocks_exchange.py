@@ -17,14 +17,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import (
-    ToGeodetic,
-    UnknownSystem,
-    is_in_degrees,
-    is_local_system,
-    to_geodetic,
-    unit_without_heights,
-)
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, is_in_degrees, to_geodetic, unit_without_heights
 from vdgs.captures.formats.block_rotations import ASK_FOR_MATRIX, TwoWays, block_rotation, has_roll, told_by_points
 from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fisheye
 from vdgs.captures.formats.camera_bands import color_cameras
@@ -32,6 +25,7 @@ from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
 from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
+from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import geodetic_from_enu

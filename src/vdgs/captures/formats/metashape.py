@@ -19,18 +19,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import (
-    ToGeodetic,
-    UnknownSystem,
-    geocentric_to_geodetic,
-    is_local_system,
-    to_geodetic,
-)
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, geocentric_to_geodetic, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsics
 from vdgs.captures.formats.metashape_project import ALIGNED, PROJECTS, StoredChunk, is_aligned, read_chunks
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
+from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import SEMI_MAJOR_M

@@ -20,7 +20,6 @@ from vdgs.captures.coordinate_systems import (
     UnknownSystem,
     has_heights,
     height_unit,
-    is_local_system,
     to_geodetic,
 )
 from vdgs.captures.formats.brown_lens import MAX_POWERS, brown_intrinsics, quarter_turn_fisheye
@@ -36,6 +35,7 @@ from vdgs.captures.formats.json_poses import (
 from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, safe_name
+from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject

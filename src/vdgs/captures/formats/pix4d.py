@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, false_origin, is_local_system, to_geodetic
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, false_origin, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import xml_numbers
+from vdgs.captures.system_names import is_local_system
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
