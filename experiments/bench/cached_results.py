@@ -21,29 +21,32 @@ from vdgs.system.atomic_files import read_json
 def read_cached_results(files: Iterable[Path]) -> dict[str, BenchResult]:
     """Key -> result of every finished run in the files; of several with one key the first.
 
-    Raises VdgsError for a file that cannot be read or is no results.json of a bench.
+    Runs that failed, were stopped or have no PSNR are left out, and so trained. Raises VdgsError for a file that cannot
+    be read or is no results.json of a bench.
     """
     results_by_key: dict[str, BenchResult] = {}
     for file in files:
         content = read_json(file)
         try:
-            results = [_result(each) for each in content["results"]]
+            results = [_result(each) for each in content["results"] if each["state"] == "done"]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise VdgsError(
                 f"--reuse-results {file}: is not what `vdgs bench` writes as results.json, or of an earlier version "
                 f"({type(error).__name__}: {error})"
             ) from error
         for each in results:
-            if each.state == "done":
+            if each.figures["psnr"] is not None:
                 results_by_key.setdefault(each.key, each)
     return results_by_key
 
 
 def _result(plain: Mapping[str, Any]) -> BenchResult:
+    """A finished run, or renders of another program that were measured, whose costs nobody knows."""
     result = BenchResult(**{each.name: plain[each.name] for each in fields(BenchResult)})
-    if not result.key or not isinstance(result.figures["psnr"], float):
+    if not result.key or not isinstance(result.figures["psnr"], float | None):
         raise ValueError("a run without key or figures")
-    if "preparation_seconds" not in result.figures:  # its seconds would stand beside others of another meaning
+    # Without them its seconds would stand beside others of another meaning.
+    if "seconds" in result.figures and "preparation_seconds" not in result.figures:
         raise ValueError("a run whose seconds are those of its steps alone")
     return replace(result, groups=tuple(result.groups), frusta=tuple(result.frusta))
 

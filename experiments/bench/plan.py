@@ -124,7 +124,7 @@ def make_plan(name: str, options: PlanOptions) -> BenchPlan:
     if options.step_factors:
         table = replace(table, title=f"{table.title}, at equal time")
     scenes = resolve_scenes(options.scenes or table.scenes, options.options, options.validation)
-    methods = tuple(_method(each) for each in options.methods or table.methods)
+    methods = _methods(options.methods or table.methods)
     seeds = table.seeds if options.seeds is None else tuple(range(options.seeds))
     seeds = tuple(options.first_seed + seed for seed in seeds)
     factors = {(scene, method): factor for scene, method, factor in options.step_factors}
@@ -184,6 +184,14 @@ def _render_runs(scene: BenchScene, methods: Sequence[BenchMethod], base: Method
 
 def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def _methods(names: Sequence[str]) -> tuple[BenchMethod, ...]:
+    """Raises VdgsError for a name that is of no method or stands there twice: a method is a row."""
+    for name in dict.fromkeys(names):
+        if names.count(name) > 1:
+            raise VdgsError(f"--methods names {name} {names.count(name)} times. Name each once; --seeds repeats them.")
+    return tuple(_method(name) for name in names)
 
 
 def _method(name: str) -> BenchMethod:

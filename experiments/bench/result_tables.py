@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from experiments.bench.definitions import BenchScene, MethodGroup
+from experiments.bench.definitions import BenchMethod, BenchScene, MethodGroup
 from experiments.bench.measure import group_names
 from experiments.bench.paper_numbers import METRIC_COLUMNS, PAPER_NUMBERS
 from experiments.bench.plan import BenchPlan
@@ -42,7 +42,8 @@ class TableRow:
 
     label: str
     cells: tuple[TableCell, ...] = ()
-    #: In the last column of an overview: whole, adapted and how, quoted, or why the row failed.
+    #: In the last column of an overview: whole, adapted and how, quoted, or why the row has no figures; and how many
+    #: seeds the figures are of where some are missing.
     rests_on: str = ""
 
 
@@ -192,12 +193,23 @@ def _overview(plan: BenchPlan, results: Sequence[BenchResult], scene: BenchScene
         plan, in_scene, f"overview-{scene.name}", f"{scene.title}: {plan.table.title}",
         [_for_scene(column, scene.name) for column in columns], (OVERVIEW_NOTE, SIZE_NOTE),
     )  # fmt: skip
-    rests_on = {method.title: method.rests_on for method in plan.methods}
-    titles = {method.name: method.title for method in plan.methods}
-    rests_on |= {titles[each.method]: each.reason or each.state for each in in_scene if each.state != "done"}
+    rests_on = {
+        method.title: _rests_on(method, [result for result in in_scene if result.method == method.name])
+        for method in plan.methods
+    }
     rows = [replace(row, rests_on=rests_on[row.label] if row.cells else "") for row in table.rows]
     rows += [_quoted_row(plan, name, scene, columns) for name in plan.table.quoted]
     return replace(table, rows=tuple(rows))
+
+
+def _rests_on(method: BenchMethod, seeds: Sequence[BenchResult]) -> str:
+    """What the figures of a method on a scene rest on, or why there are none; `seeds`: its results."""
+    unfinished = [each for each in seeds if each.state != "done"]
+    if not unfinished:
+        return method.rests_on
+    if len(unfinished) == len(seeds):
+        return unfinished[-1].reason or unfinished[-1].state
+    return f"{method.rests_on}; {len(seeds) - len(unfinished)} of {len(seeds)} seeds"
 
 
 def _quoted_row(plan: BenchPlan, name: str, scene: BenchScene, columns: Sequence[TableColumn]) -> TableRow:

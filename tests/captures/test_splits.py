@@ -97,6 +97,19 @@ def test_the_lists_of_scannet_are_read(tmp_path, scene, place):
     assert [view.name for view in load_capture(tmp_path, UP).test_views] == [names[5]]
 
 
+def test_photographs_that_the_lists_of_scannet_leave_out_are_counted(tmp_path, scene):
+    names = sorted(scene.cameras)
+    write_colmap(tmp_path, scene)
+    lists = tmp_path / "train_test_lists.json"
+    for training, unlisted in ((names[2:], 0), (names[4:], 2), ([], 0), (7, 0)):
+        lists.write_text(json.dumps({"train": training, "test": names[:2]}))
+        capture = load_capture(tmp_path, UP)
+        assert len(capture.train_views) == len(names) - 2
+        said = [warning for warning in capture.warnings if "neither under train nor under test" in warning]
+        assert len(said) == bool(unlisted)
+        assert all(f"{lists}: 2 of {len(names)} photographs" in each and names[2] in each for each in said)
+
+
 @pytest.mark.parametrize("name", ["test.txt", "train_test_lists.json"])
 @pytest.mark.parametrize("inside", [True, False])
 def test_lists_beside_the_photographs_are_read_and_said(tmp_path, scene, name, inside):

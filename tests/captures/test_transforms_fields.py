@@ -209,6 +209,24 @@ def test_both_angles_stand_in_for_both_focal_lengths(tmp_path):
     assert lens.focal == pytest.approx((500.0, 520.0))
 
 
+def test_masks_that_frames_lack_are_asked_for_where_the_others_are_named(tmp_path, scene):
+    content = write_transforms(tmp_path, scene)
+    names = [Path(frame["file_path"]).name for frame in content["frames"]]
+    (tmp_path / "mine").mkdir()
+    cv2.imwrite(str(tmp_path / "mine" / "one.png"), np.full((48, 64), 255, np.uint8))
+    for frame in content["frames"][1:]:
+        frame["mask_path"] = "mine/one.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (said,) = [warning for warning in load_capture(tmp_path).warnings if "have a mask" in warning]
+    assert "mask_path" in said
+    proposed = Path(said.rsplit(" ", 1)[1].removesuffix("."))
+    proposed.parent.mkdir(parents=True)
+    cv2.imwrite(str(proposed), np.full((48, 64), 255, np.uint8))
+    capture = load_capture(tmp_path)  # one put where the warning says counts
+    assert {view.name: view.mask_path for view in capture.views}[names[0]] == proposed
+    assert not any("have a mask" in warning for warning in capture.warnings)
+
+
 def test_the_mask_that_a_frame_names_counts_before_one_in_the_folder_of_masks(tmp_path, scene):
     content = write_transforms(tmp_path, scene)
     name = Path(content["frames"][0]["file_path"]).name

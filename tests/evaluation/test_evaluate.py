@@ -134,13 +134,23 @@ def test_a_view_that_is_masked_entirely_leaves_the_means_alone(city: City, tmp_p
     assert result["psnr"] == pytest.approx(np.mean([rows[i]["psnr"] for i in (0, 2, 3)]))
 
 
-def test_a_perfect_render_is_null_not_infinity(city: City, tmp_path: Path):
-    def perfect(camera):
-        return as_render(city.photographs[round(camera.camera_from_world[0, 3])])
+@pytest.mark.parametrize("exact", [(1,), (0, 1, 2, 3)])
+def test_views_equal_to_their_photographs_count_a_hundred_decibels(city: City, tmp_path: Path, exact: tuple[int, ...]):
+    """A mean with one of them is a figure, and neither infinite nor unknown."""
 
-    result = evaluate_model(city.taken, RenderableModel(render=perfect), tmp_path)
-    assert result["psnr"] is None
-    assert result["ssim"] == pytest.approx(1.0)
+    def render(camera):
+        index = round(camera.camera_from_world[0, 3])
+        return as_render(city.photographs[index]) if index in exact else city.render(camera)
+
+    result = evaluate_model(city.taken, RenderableModel(render=render), tmp_path)
+    found = [row["psnr"] for row in read(tmp_path / "per_view.json")]
+    expected = [100.0 if i in exact else psnr(city.renders[i], city.photographs[i]) for i in range(4)]
+    assert found == pytest.approx(expected)
+    assert result["psnr"] == pytest.approx(np.mean(expected))
+    assert read(tmp_path / "metrics.json")["psnr"] == result["psnr"]
+    assert result["notes"][-1].startswith(
+        f"{len(exact)} of 4 views equal their photographs (or all but): PSNR 100 dB each"
+    )
 
 
 def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):

@@ -13,6 +13,7 @@ from scipy.ndimage import convolve
 from support.photographs import noisy, photograph, psnr, real_photographs, ssim
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram, format_bounds, quantile_groups, view_bins
+from vdgs.evaluation.metrics import MAX_PSNR_DB, psnr_from_mse
 
 
 def direct_ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -39,7 +40,9 @@ def test_psnr_of_a_known_error():
     one_level = np.ones_like(black)
     assert psnr(one_level, black) == pytest.approx(20 * math.log10(255))
     assert psnr(np.full_like(black, 255), black) == pytest.approx(0.0)
-    assert psnr(black, black) == math.inf
+    assert psnr(black, black) == MAX_PSNR_DB == 100.0  # not infinite, so that means with equal images are figures
+    assert psnr_from_mse(1e-12) == 100.0
+    assert math.isnan(psnr_from_mse(math.nan))
 
 
 def test_psnr_equals_the_definition():

@@ -14,8 +14,13 @@ from experiments.bench.bench import BenchSettings, run_bench
 from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
 from experiments.bench.plan import PlanOptions, make_plan
 from experiments.bench.results import BenchResult
+from experiments.bench.scenes import SCENES
 from support.bench import InThisProcess, write_data
+from vdgs.captures.image_cache import load_image
+from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
+from vdgs.evaluation.comparison_images import write_png
 
 pytestmark = [pytest.mark.xdist_group("bench_cached_results"), pytest.mark.slow]
 
@@ -141,6 +146,42 @@ def test_seconds_of_another_meaning_do_not_stand_beside_others(there, tmp_path):
     (tmp_path / "results.json").write_text(json.dumps(content))
     with pytest.raises(VdgsError, match="seconds are those of its steps alone"):
         read_cached_results([tmp_path / "results.json"])
+
+
+@pytest.mark.parametrize("state", ["failed", "stopped", "missing"])
+def test_of_an_interrupted_bench_the_finished_runs_are_taken(data, there, tmp_path, state):
+    content = json.loads(there.read_text())
+    finished, other = content["results"]
+    content["results"] = [finished, other | {"state": state, "key": "", "figures": {}, "groups": [], "frusta": []}]
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps(content))
+    assert list(read_cached_results([file])) == [finished["key"]]
+    if state == "stopped":
+        results, said = bench(asked(data, tmp_path / "out", known=(file,)))
+        assert "1 of 2 runs are known" in said
+        assert {each.state for each in results.values()} == {"done"}
+
+
+def test_measured_renders_of_another_program_are_taken(data, tmp_path):
+    """Also where one equals the photographs; their costs are unknown."""
+    (tmp_path / "theirs" / "copr").mkdir(parents=True)
+    for view in load_capture(data / "copr", CaptureOptions(**SCENES["copr"].options)).test_views:
+        write_png(tmp_path / "theirs" / "copr" / f"{Path(view.name).stem}.png", load_image(view).image.numpy())
+    settings = asked(data, tmp_path / "one")
+    options = replace(settings.plan_options, renders=(f"Exact={tmp_path / 'theirs'}",))
+    results, _ = bench(replace(settings, plan_options=options))
+    assert results["exact", 0].figures["psnr"] == 100.0
+    known = (tmp_path / "one" / "table2" / "results.json",)
+    again, said = bench(replace(asked(data, tmp_path / "two", known=known), plan_options=options))
+    assert "3 of 3 runs are known" in said
+    assert again["exact", 0] == results["exact", 0]
+
+
+def test_a_run_without_psnr_is_measured_again(there, tmp_path):
+    content = json.loads(there.read_text())
+    content["results"][0]["figures"]["psnr"] = None
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    assert list(read_cached_results([tmp_path / "results.json"])) == [content["results"][1]["key"]]
 
 
 def test_groups_of_other_pixels_are_not_compared(there):

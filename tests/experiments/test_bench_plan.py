@@ -261,6 +261,11 @@ def test_pixels_are_grouped_by_the_same_model_whichever_methods_stand_beside_the
     assert make_plan("table1", PlanOptions(scenes=("seneca",), methods=("3dgs-black",))).reference("seneca") is None
 
 
+def test_a_method_that_is_named_twice_is_refused():
+    with pytest.raises(VdgsError, match="--methods names full 2 times"):
+        make_plan("table1", PlanOptions(methods=("full", "coarse", "full")))
+
+
 def test_choices_change_the_budget_for_all_alike():
     plan = make_plan("table2", PlanOptions(scenes=("tiny",), seeds=2, total_iterations=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)

@@ -4,6 +4,7 @@ import csv
 import io
 import math
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -235,6 +236,21 @@ def test_an_overview_says_what_each_row_rests_on():
     row = make_result_tables(quoted, [])[0].rows[-1]
     figures = [cell.summary and cell.summary.mean for cell in row.cells[:5]]
     assert figures == [None, None, 22.57, 0.654, 0.352]  # the paper's are color-corrected
+
+
+def test_an_overview_says_of_how_many_seeds_the_figures_are():
+    plan = make_plan("table1", PlanOptions(scenes=("lab-uneven",), methods=("full", "baseline", "coarse")))
+    finished = results_with(dict.fromkeys(("full", "baseline", "coarse"), (0.0, 0.0)))
+    results = [
+        replace(each, state="stopped", reason="not started", figures={}, groups=())
+        if each.method == "baseline" or (each.method == "full" and each.seed) else each
+        for each in finished
+    ]  # fmt: skip
+    said = {row.label: row.rests_on for row in make_result_tables(plan, results)[0].rows}
+    titles = {name: METHODS[name].title for name in ("full", "baseline", "coarse")}
+    assert said[titles["full"]] == f"{METHODS['full'].rests_on}; 1 of 3 seeds"
+    assert said[titles["baseline"]] == "not started"
+    assert said[titles["coarse"]] == METHODS["coarse"].rests_on
 
 
 def test_a_method_without_a_published_program_is_never_called_whole():

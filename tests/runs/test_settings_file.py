@@ -118,6 +118,12 @@ def test_a_file_that_does_not_work_is_explained(text, says, tmp_path):
     assert says in str(raised.value)
 
 
+@pytest.mark.parametrize("text", ["training:", "capture:", "training:\n  densify:\nblock: {}", "training: ~", "vdgs:"])
+def test_a_section_whose_settings_are_all_commented_out_sets_nothing(text, tmp_path):
+    (tmp_path / "settings.yaml").write_text(f"{text}\n# seed: 1\n")
+    assert read_settings_file(tmp_path / "settings.yaml") == ({}, {})
+
+
 def test_a_path_in_a_file_may_begin_in_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     (tmp_path / "settings.yaml").write_text("capture: {images: ~/small, gps: ~/gps.csv, georef: ./~g.json}")

@@ -34,9 +34,11 @@ def find_masks(
         _compare(folder, masks, asked_for, warnings)
     without = [name for name, mask in masks.items() if mask is None]
     if 0 < len(without) < len(masks):
+        named = any(view.mask_path for view in views)
+        remedy = "name the missing masks with mask_path as well, or " if named else ""
         warnings.append(
             f"{len(masks) - len(without)} of {len(masks)} photographs have a mask; the others count whole. If that is "
-            f"not meant, put the missing masks there, such as {folder / mask_name(without[0])}."
+            f"not meant, {remedy}put the missing masks there, such as {folder / mask_name(without[0])}."
         )
     return masks
 

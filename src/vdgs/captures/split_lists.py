@@ -16,6 +16,7 @@ from vdgs.captures.formats.listed_names import find_listed
 from vdgs.captures.formats.source_capture import TEST_LISTS
 from vdgs.captures.name_resolution import NameLookup
 from vdgs.errors import CaptureError
+from vdgs.system.units import first_names
 
 #: Lists that a capture may bring.
 TEST_LIST, VALIDATION_LIST = TEST_LISTS[0], "validation.txt"
@@ -82,14 +83,32 @@ def _meant(file: Path, photographs: Sequence[str]) -> set[str] | None:
 def listed_photographs(
     file: Path, names: Sequence[str], *, some: bool, strict: bool = False
 ) -> tuple[set[str], list[str]]:
-    """Those of `names` that a text file lists, one a line, or a JSON file under `test`, and a warning about those that
-    mean none of them. Raises CaptureError for a list that cannot be read or names nothing where `some` are needed, and
-    as `find_listed`."""
+    """Those of `names` that a text file lists, one a line, or a JSON file under `test`, and warnings about those that
+    mean none of them and about photographs that a JSON file has neither there nor under `train`. Raises CaptureError
+    for a list that cannot be read or names nothing where `some` are needed, and as `find_listed`."""
     wanted = _names_in(file)
+    is_json = file.suffix.lower() == ".json"
     if some and not wanted:
-        how = "Name images in the list under test" if file.suffix.lower() == ".json" else "Write one image name a line"
+        how = "Name images in the list under test" if is_json else "Write one image name a line"
         raise CaptureError(f"{file}: names no photograph. {how}, or ignore lists with --split every.")
-    return find_listed(wanted, names, str(file), strict=strict)
+    found, warnings = find_listed(wanted, names, str(file), strict=strict)
+    return found, warnings + (_note_of_unlisted(file, wanted, names) if is_json else [])
+
+
+def _note_of_unlisted(file: Path, tests: Sequence[str], names: Sequence[str]) -> list[str]:
+    """A note about the photographs that a JSON file of two lists has in neither; none where it has no list `train`."""
+    training = _texts_under("train", file.read_text(encoding="utf-8-sig"))
+    if not training:
+        return []
+    lookup = NameLookup((name, name) for name in names)
+    listed = {meant for line in (*training, *tests) for meant in lookup.find(line)[1]}
+    unlisted = [name for name in names if name not in listed]
+    if not unlisted:
+        return []
+    return [
+        f"{file}: {len(unlisted)} of {len(names)} photographs stand neither under train nor under test, and count as "
+        f"training photographs ({first_names(unlisted)})."
+    ]
 
 
 def _names_in(file: Path) -> list[str]:
@@ -107,10 +126,16 @@ def _names_in(file: Path) -> list[str]:
 
 def _names_in_json(file: Path, text: str) -> list[str]:
     """The list `test` of a JSON file. Raises CaptureError where there is none."""
-    try:
-        names = json.loads(text)["test"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        names = None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+    names = _texts_under("test", text)
+    if names is None:
         raise CaptureError(f'{file}: must hold {{"test": [names of photographs]}}. Write that, or use --split every.')
     return names
+
+
+def _texts_under(key: str, text: str) -> list[str] | None:
+    """The list of texts under a key of a JSON object; None where there is none."""
+    try:
+        names = json.loads(text)[key]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return names if isinstance(names, list) and all(isinstance(name, str) for name in names) else None

@@ -61,8 +61,10 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings", *,
 def flat_values(kind: type, values: Any, where: str, also: Iterable[str] = ()) -> dict[tuple[str, ...], Any]:
     """The values of some settings of a config class, as people write them, by the names of the fields down to them.
 
-    Raises what `from_dict` raises. `also` are further names that are there.
+    A group with nothing in it, which YAML reads as None, sets nothing. Raises what `from_dict` raises. `also` are
+    further names that are there.
     """
+    values = {} if values is None else values
     if not isinstance(values, Mapping):
         raise ValueError(f"{where} is {values!r}, not a group of settings")
     hints, flat = field_hints(kind), dict[tuple[str, ...], Any]()

@@ -29,6 +29,7 @@ from vdgs.evaluation.by_visibility import VisibilityHistogram, mean_or_none, vie
 from vdgs.evaluation.depth_errors import METRIC_NAMES, DepthErrors, summarize_depth_errors
 from vdgs.evaluation.lpips import Lpips
 from vdgs.evaluation.metric_tables import make_metrics_table
+from vdgs.evaluation.metrics import MAX_PSNR_DB
 from vdgs.evaluation.opacity_coverage import summarize_opacity_coverage, summarize_oversized_splats
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.evaluation.splat_artifacts import ANGLE_EDGES, ARTIFACT_KEYS, summarize_artifacts
@@ -148,6 +149,9 @@ def _summary(
     notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
     if unfitted:
         notes.append(f"color correction: too few unsaturated pixels in {unfitted} views, left as they are")
+    if equal := sum((row["psnr"] or 0.0) >= MAX_PSNR_DB for row in rows):
+        bound = f"PSNR {MAX_PSNR_DB:g} dB each, the most that counts"
+        notes.append(f"{equal} of {len(rows)} views equal their photographs (or all but): {bound}")
     result = {
         **{name: mean_or_none([row[name] for row in rows]) for name in keys + REFERENCE_EXPOSURE_KEYS},
         "by_visibility": pixel_bins,

@@ -20,6 +20,8 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+#: PSNR is at most this, as in training logs: of equal images it would be infinite, and so would a mean with one.
+MAX_PSNR_DB = 100.0
 
 
 def to_8bit(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
@@ -35,10 +37,8 @@ def squared_error(image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray
 
 
 def psnr_from_mse(mean_squared_error: float) -> float:
-    """Peak signal-to-noise ratio in dB of a mean squared error on [0, 1]; inf where it is zero."""
-    if mean_squared_error == 0.0:
-        return float("inf")
-    return float(-10.0 * np.log10(mean_squared_error))
+    """Peak signal-to-noise ratio in dB of a mean squared error on [0, 1], `MAX_PSNR_DB` at most; NaN of NaN."""
+    return float(-10.0 * np.log10(np.maximum(mean_squared_error, 10.0 ** (-MAX_PSNR_DB / 10.0))))
 
 
 def ssim_map(

@@ -50,7 +50,7 @@ def read_settings_file(path: Path) -> tuple[Values, Values]:
     try:
         if isinstance(capture, Mapping):  # config.yaml also says where the capture of its run lies
             capture = {key: value for key, value in capture.items() if key != "path"}
-        options = flat_values(CaptureOptions, {} if capture is None else capture, "capture")
+        options = flat_values(CaptureOptions, capture, "capture")
         method = flat_values(MethodConfig, sections, "", also=("capture",))
         check_ranges(with_values(CaptureOptions(), options))
         check_ranges(with_values(MethodConfig(), method))
