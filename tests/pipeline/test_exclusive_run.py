@@ -27,13 +27,16 @@ from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import RunError
 from vdgs.pipeline.dry_run import estimate_run
+from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.runs.create_or_resume import create_or_resume_run, exclusive_run
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.sfm.discarding import discard_training
 from vdgs.sfm.reconstruct import writing
 from vdgs.system.atomic_files import write_json
+from vdgs.system.file_locks import is_locked
 
 #: Another process that drives a run: it holds the lock of which it is told until its input ends.
 DRIVER = (
@@ -47,14 +50,21 @@ AT_WORK = "another vdgs process works on this run"
 
 
 @contextmanager
+def held_elsewhere(folder: Path) -> Iterator[Callable[[], None]]:
+    """Another process holds the lock of a folder, until what is given is called."""
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-S", "-c", DRIVER, str(folder / ".lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdin is not None
+        holder.stdout.readline()
+        yield holder.stdin.close
+
+
+@contextmanager
 def driven_elsewhere(run: RunFolder) -> Iterator[None]:
     """Another process takes the run from stage to stage; at the moment it is between two of them."""
-    lock = run.path / ".run" / ".lock"
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-S", "-c", DRIVER, str(lock)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as driver:
-        assert driver.stdout is not None
-        driver.stdout.readline()
+    with held_elsewhere(run.path / ".run"):
         yield
 
 
@@ -128,6 +138,40 @@ def test_a_block_is_trained_beside_who_drives_the_run(run, capsys):
     with driven_elsewhere(run):
         assert command_line("train-blocks", run.path, "--block", "0") == 1
     assert "vdgs partition" in capsys.readouterr().err  # it is not refused for its driver
+
+
+class Listener(io.StringIO):
+    """A stream that does something once it is written to."""
+
+    def __init__(self, then: Callable[[], None]) -> None:
+        super().__init__()
+        self.then = then
+
+    def write(self, text: str) -> int:
+        self.then()
+        return super().write(text)
+
+
+def test_who_drives_a_run_waits_for_another_command_that_trains_its_blocks(run):
+    """`vdgs train-blocks RUN` on another machine is no failure of the run."""
+    context = RunContext(run)
+    with held_elsewhere(run.path) as release:
+        with pytest.raises(RunError, match=AT_WORK):  # of `vdgs merge`
+            merge_run_blocks(context, False, Console(file=io.StringIO()))
+        listener = Listener(release)
+        with run.drive_lock(), pytest.raises(RunError, match="vdgs partition"):  # which comes once it has the lock
+            merge_run_blocks(context, False, Console(file=listener))
+    assert "waiting for it" in listener.getvalue()
+
+
+def test_a_block_that_another_command_trains_is_waited_for(run):
+    with held_elsewhere(run.block(0).path) as release:
+        with pytest.raises(RunError, match=AT_WORK), run.block(0).locked():
+            pass
+        listener = Listener(release)
+        with run.block(0).locked(on_wait=lambda: listener.write("waits")):
+            assert is_locked(run.block(0).path)
+    assert listener.getvalue() == "waits"
 
 
 @pytest.mark.parametrize("shared", [True, False])

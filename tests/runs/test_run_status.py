@@ -262,6 +262,20 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
         load_verified(run.merged, run.keys().merge, 0)
 
 
+def test_a_model_that_the_system_does_not_let_be_read_is_not_to_be_deleted(run, monkeypatch):
+    unreadable, opened = run.block(0).model, Path.open
+
+    def refuse(path, *arguments, **others):
+        if path == unreadable:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, *arguments, **others)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    status = get_run_status(run)
+    assert (status.of("block 0").state, status.next_command()) == ("unknown", "")
+    assert next_line(status) == f"to mend: {unreadable}: Permission denied"
+
+
 @pytest.fixture
 def opened_without_photographs(monkeypatch):
     monkeypatch.setattr("vdgs.runs.open_run.open_capture", lambda run: Mock(Capture, test_views=(), train_views=()))

@@ -30,10 +30,15 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
     """Merge the blocks of a run into RUN/merged; nothing if they are merged already.
 
     Raises RunError if a block is missing or failed, even where an earlier merge did without it, unless
-    `allow_missing_blocks`: the coarse anchors then stand in.
+    `allow_missing_blocks`: the coarse anchors then stand in. Who drives the run waits for others that train its blocks
+    (`vdgs train-blocks`); else RunError where another process works on it.
     """
     run = context.run
-    with run.locked():
+
+    def say_who_is_waited_for() -> None:
+        console.print(f"{run.path}: another vdgs process works on its blocks; waiting for it", highlight=False)
+
+    with run.locked(on_wait=say_who_is_waited_for if run.is_driven_here() else None):
         keys, blocks = run.keys(), load_run_blocks(run)
         folders = [run.block(index) for index in range(len(blocks))]
         done = [folder.needs_no_work(keys.blocks) for folder in folders]

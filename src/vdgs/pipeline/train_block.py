@@ -50,12 +50,14 @@ from vdgs.visibility.visibility_counts import effective_sample_size
 
 
 def train_block(
-    context: RunContext, index: int, options: CheckpointOptions, console: Console, device: str = "cpu"
-) -> None:
+    context: RunContext, index: int, options: CheckpointOptions, console: Console, device: str = "cpu",
+    wait: bool = False,
+) -> None:  # fmt: skip
     """Train, or continue, one block of a run on a device; nothing if it is finished.
 
     Works beside other blocks of the run, in this or in other processes. Raises RunError if the run is not cut into
-    blocks or has no such block, and what training raises (see `train_with_checkpoints`).
+    blocks or has no such block, or another process trains the block, unless it is to `wait` for that; and what training
+    raises (see `train_with_checkpoints`).
     """
     options.check()
     run = context.run
@@ -64,7 +66,11 @@ def train_block(
         if not 0 <= index < len(blocks):
             raise RunError(f"{run.path}: has blocks 0 to {len(blocks) - 1}; there is no block {index}")
         folder, key = run.block(index), run.keys().blocks
-        with folder.locked():
+
+        def say_who_is_waited_for() -> None:
+            console.print(f"{folder.path}: another vdgs process trains this block; waiting for it", highlight=False)
+
+        with folder.locked(say_who_is_waited_for if wait else None):
             if folder.needs_no_work(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
@@ -73,9 +79,11 @@ def train_block(
 
 
 def train_shard(shard: Shard) -> None:
-    """Train, or continue, a block of RUN/blocks for `vdgs train-blocks RUN`."""
+    """Train, or continue, a block of RUN/blocks for `vdgs train-blocks RUN`, or wait for who trains it: a block that
+    somebody trains beside a run is none that failed."""
     options = replace(shard.request(CheckpointOptions), image_cache_gb=shard.image_gb)
-    train_block(RunContext.from_path(shard.folder.parent), shard.index, options, shard.console, shard.device)
+    context = RunContext.from_path(shard.folder.parent)
+    train_block(context, shard.index, options, shard.console, shard.device, wait=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

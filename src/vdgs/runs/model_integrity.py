@@ -19,11 +19,12 @@ MODEL_MISMATCH = "not the model that status.json beside it speaks of"
 def integrity_error(stage: StageFolder, key: str, block: int | None = None) -> str:
     """What the model of a finished stage is instead of its own; empty where it may be that.
 
-    By the header and the size of the file alone, which cost nothing.
+    By the header and the size of the file alone, which cost nothing. Raises OSError where the system does not let it be
+    read, which says nothing of it.
     """
     try:
         metadata = read_model_metadata(stage.model)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return "not a model that can be read"
     if metadata.block != block:
         return "a model of the whole scene" if metadata.block is None else f"the model of block {metadata.block}"

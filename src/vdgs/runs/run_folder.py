@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,12 +217,12 @@ class RunFolder:
         return self.coarse.status().model_id
 
     @contextmanager
-    def locked(self, shared: bool = False) -> Iterator[None]:
+    def locked(self, shared: bool = False, on_wait: Callable[[], object] | None = None) -> Iterator[None]:
         """Lock the run for this process, or share it with others that do (blocks are trained side by side).
 
-        RunError if another process holds it.
+        RunError if another process holds it, unless that is waited for (as `lock_folder` has it).
         """
-        with lock_folder(self.path, shared):
+        with lock_folder(self.path, shared, on_wait):
             yield
 
     @contextmanager
@@ -240,6 +240,10 @@ class RunFolder:
     def is_running(self) -> bool:
         return is_known_locked(self._driver)
 
+    def is_driven_here(self) -> bool:
+        """Whether it is this process that takes the run from stage to stage."""
+        return self.path.resolve() in _driven
+
     @property
     def progress_file(self) -> Path:
         """How far the process that drives the run is."""
@@ -248,7 +252,7 @@ class RunFolder:
     def begin_step(self, stage: str, step: str = "", unit: str = "", total: int = 0) -> StepProgress:
         """Record what this process works on, if this process drives the run; what is returned takes how many are
         done. Another process, such as `vdgs ortho` beside `vdgs run`, records nothing."""
-        file = self.progress_file if self.path.resolve() in _driven else None
+        file = self.progress_file if self.is_driven_here() else None
         progress = StepProgress(file, StepRecord(stage=stage, step=step, unit=unit, total=total))
         progress(0)
         return progress

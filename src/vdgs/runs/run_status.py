@@ -56,6 +56,8 @@ class StageStatus:
     """The command that makes the stage, where no verb makes this stage alone."""
     step: StepRecord | None = None
     """The progress of the step in which the stage is, or was stopped."""
+    problem: str = ""
+    """Why its output cannot be read, which says nothing against it: a permission, a disk that is away."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,7 @@ def get_run_status(run: RunFolder, settings: RunSettings | None = None) -> RunSt
     if driven and (step := read_step(run.progress_file)) is not None:
         stages = tuple(_at_work(stage, step) if stage.name == step.stage else stage for stage in stages)
     written = "" if why or command else run_command(run.settings(), run.path)
+    problem = problem or next((stage.problem for stage in stages if stage.problem), "")
     return RunStatus(run.path, stages, command, written, driven, problem)
 
 
@@ -237,7 +240,15 @@ class _StatusScanner:
             hint = f"rm {shell_word(folder.status_file)} && "
             return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)), hint=hint)
         state, why = self._state_of(folder, status, key, other, locked)
-        if state == "done" and (wrong := integrity_error(folder, key or "", _number(name))):
+        try:
+            wrong = integrity_error(folder, key or "", _number(name)) if state == "done" else ""
+        except OSError as error:
+            reason = f"{folder.model.name} cannot be read ({error.strerror})"
+            problem = f"{folder.model}: {error.strerror}"
+            return StageStatus(
+                name=name, state="unknown", folder=inside, reason=reason, status=status, problem=problem
+            )  # fmt: skip
+        if wrong:
             reason = f"model.safetensors is {wrong}"
             hint = f"rm -r {shell_word(path_to_delete(folder))} && "
             return StageStatus(name=name, state="stale", folder=inside, reason=reason, status=status, hint=hint)

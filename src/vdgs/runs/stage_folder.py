@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from vdgs.errors import RunError
 from vdgs.model.model_metadata import is_cut_off
 from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.system.atomic_files import read_json, write_json, write_text
-from vdgs.system.file_locks import lock_folder
+from vdgs.system.file_locks import is_known_locked, lock_folder
 from vdgs.system.records import record_from_dict, record_to_compact_dict
 
 
@@ -129,18 +129,15 @@ class StageFolder:
         return self.is_done(key) and not is_cut_off(self.model)
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Lock this stage for this process; RunError if another one works on it."""
-        with lock_folder(self.path):
+    def locked(self, on_wait: Callable[[], object] | None = None) -> Iterator[None]:
+        """Lock this stage for this process; RunError if another one works on it, unless that is waited for (as
+        `lock_folder` has it)."""
+        with lock_folder(self.path, on_wait=on_wait):
             yield
 
     def is_locked_elsewhere(self) -> bool:
         """Whether another process works on this stage. A folder that cannot be written is locked by none."""
-        try:
-            with self.locked():
-                return False
-        except RunError as error:
-            return isinstance(error.__cause__, BlockingIOError)
+        return is_known_locked(self.path)
 
     def truncate_log(self, iteration: int) -> None:
         """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""

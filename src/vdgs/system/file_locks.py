@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import fcntl
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from vdgs.errors import RunError
 from vdgs.system.atomic_files import disk_hint
+from vdgs.system.stop_signals import check_stop_requested
 
 #: The file in a folder that is locked.
 LOCK_FILE = ".lock"
 #: Attempts to take a lock, and seconds between them: `is_locked` holds it too, for a moment.
 LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
+#: Seconds between attempts of a process that waits for another one.
+WAIT_SECONDS = 0.5
 
 
 def is_locked(folder: Path) -> bool:
@@ -41,9 +45,10 @@ def is_known_locked(folder: Path) -> bool:
 
 
 @contextmanager
-def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, shared: bool = False, on_wait: Callable[[], object] | None = None) -> Iterator[None]:
     """Hold the lock of a folder, exclusive or `shared`; the folder is created if missing. Raises RunError if another
-    process holds it, or the folder cannot be written."""
+    process holds it, or the folder cannot be written. With `on_wait` another process is waited for, after that was
+    called once; Interrupted where a stop is asked for meanwhile."""
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,18 +57,30 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror}). {disk_hint(error)}.") from error
     with handle:
-        for attempt in range(LOCK_ATTEMPTS):
-            try:
-                fcntl.flock(handle, kind | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if attempt + 1 == LOCK_ATTEMPTS:
-                    problem = "another vdgs process works on this run. Wait for it or stop it."
-                    raise RunError(f"{folder}: {problem}") from error
+        attempts = 0
+        while not _is_taken(handle, kind, folder):
+            attempts += 1
+            if attempts < LOCK_ATTEMPTS:
                 time.sleep(LOCK_SECONDS)
-            except OSError as error:
-                raise RunError(
-                    f"{folder}: its file system locks no files ({error.strerror}). Mount it with locks (NFS 4; Lustre: "
-                    "-o flock), or choose a folder elsewhere."
-                ) from error
+                continue
+            if on_wait is None:
+                raise RunError(f"{folder}: another vdgs process works on this run. Wait for it or stop it.")
+            if attempts == LOCK_ATTEMPTS:
+                on_wait()
+            check_stop_requested()
+            time.sleep(WAIT_SECONDS)
         yield
+
+
+def _is_taken(handle: BinaryIO, kind: int, folder: Path) -> bool:
+    """Whether this process has the lock now. Raises RunError where the file system has no locks."""
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise RunError(
+            f"{folder}: its file system locks no files ({error.strerror}). Mount it with locks (NFS 4; Lustre: "
+            "-o flock), or choose a folder elsewhere."
+        ) from error
+    return True
