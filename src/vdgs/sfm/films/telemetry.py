@@ -108,7 +108,8 @@ def _on_one_clock(records: Sequence[Telemetry]) -> tuple[Telemetry, ...]:
     if all(one < other for one, other in pairwise(moments)):
         return tuple(records)
     starts = sorted(moment - timedelta(seconds=record.seconds) for moment, record in zip(moments, clocked, strict=True))
-    start = starts[len(starts) // 2]
+    cut_off = timedelta(seconds=0 if any(moment.microsecond for moment in moments) else 0.5)  # what is, in the median
+    start = starts[len(starts) // 2] + cut_off
     return tuple(
         record if record.moment is None else replace(record, moment=start + timedelta(seconds=record.seconds))
         for record in records
