@@ -173,6 +173,54 @@ def test_positions_lie_between_those_of_the_records_and_are_not_made_up():
     assert telemetry_at((), 1.0).lat_lon is None
 
 
+def test_in_a_long_gap_of_records_a_place_holds_as_long_as_at_the_ends():
+    blocks = [(t, f"[latitude: {47 + t / 100}] [longitude: 8.0] [rel_alt: {t}]") for t in (0.0, 1.0, 2.0, 8.0, 9.0)]
+    records = read_telemetry(blocks)
+    known = {t: telemetry_at(records, t) for t in (1.5, 2.5, 3.5, 5.0, 6.5, 7.5, 8.5)}
+    assert [t for t, each in known.items() if each.lat_lon is None] == [3.5, 5.0, 6.5]
+    assert known[5.0].relative_altitude is None
+    assert known[2.5].lat_lon == records[2].lat_lon
+    assert known[7.5].lat_lon == records[3].lat_lon
+    assert known[8.5].lat_lon == pytest.approx((47.085, 8.0))
+
+
+def test_a_record_without_a_fix_changes_nothing_around_it():
+    """Drones write 0 for the place and the heights then; the gimbal and the clock go on."""
+    words = "2026-06-01 10:00:{t:02d}.000 [latitude: {lat}] [longitude: {lon}] [rel_alt: {h} abs_alt: {h}] [gb_yaw: {t}"
+    words += " gb_pitch: -90.0 gb_roll: 0.0]"
+    lost = {2, 5, 6, 7}
+    blocks = [
+        (float(t), words.format(t=t, **({"lat": 0.0, "lon": 0.0, "h": 0.0} if t in lost else
+                                        {"lat": 47 + t / 100, "lon": 8.0, "h": 100.0})))
+        for t in range(10)
+    ]  # fmt: skip
+    records = read_telemetry(blocks)
+    for seconds in (1.5, 2.0, 2.5):
+        known = telemetry_at(records, seconds)
+        assert known.lat_lon == pytest.approx((47 + seconds / 100, 8.0))
+        assert (known.altitude, known.relative_altitude) == (100.0, 100.0)
+    assert [telemetry_at(records, t).lat_lon for t in (5.5, 6.0, 6.5)] == [None] * 3
+    known = telemetry_at(records, 6.25)
+    assert (known.altitude, known.relative_altitude) == (None, None)
+    assert known.gimbal == (6.0, -90.0, 0.0)
+    assert known.moment == datetime(2026, 6, 1, 10, 0, 6, 250_000)
+    heights = read_telemetry([(0.0, "H 10.0m"), (1.0, "H 20.0m")])  # of a film without any place
+    assert telemetry_at(heights, 0.5).relative_altitude == pytest.approx(15)
+
+
+def test_moments_rise_along_a_film_whose_records_have_whole_seconds():
+    blocks = [
+        (k / 30, f"2026-06-01 10:00:{int(7.4 + k / 30):02d} [latitude: 47.0] [longitude: 8.0]") for k in range(90)
+    ]
+    records = read_telemetry(blocks)
+    moments = [telemetry_at(records, k / 30).moment for k in range(90)]
+    assert moments == sorted(set(moments))
+    assert abs((moments[0] - datetime(2026, 6, 1, 10, 0, 7, 400_000)).total_seconds()) < 0.05
+    gap = [block for k, block in enumerate(blocks) if not 10 < k < 80]
+    at = [telemetry_at(read_telemetry(gap), t / 10).moment for t in range(32)]
+    assert at == sorted(set(at))
+
+
 def test_frames_are_apart_sharp_and_know_their_place(taken: tuple[ImageList, str]):
     images, said = taken
     numbers = [int(photo.path.stem.rpartition("_")[2]) for photo in images.images]
@@ -252,12 +300,37 @@ def test_films_of_folders_and_of_several_cards(flight: Path, tmp_path: Path):
     for card in ("A", "B"):
         (tmp_path / card).mkdir()
         shutil.copy(flight, tmp_path / card / "DJI 1.MP4")
-    (tmp_path / "B" / "DJI 1.MP4").write_bytes(flight.read_bytes())
+    (tmp_path / "B" / "DJI 1.MP4").write_bytes(flight.read_bytes() + b"\0\0\0\x08free")
     assert is_image_folder(tmp_path / "A")
     assert is_image_folder(flight)
     images, _ = take(ask(tmp_path / "out", tmp_path / "A", tmp_path / "B", num_frames=8))
     assert {photo.camera for photo in images.images} == {"DJI FC3582 no. DJI_1", "DJI FC3582 no. DJI_1_2"}
     assert len(images.images) <= 8
+
+
+def test_films_have_cameras_of_their_own_in_any_script(tmp_path: Path):
+    for number, name in enumerate(("航拍一", "航拍二", "a&b's_ü", "cafe\u0301")):
+        write_film(tmp_path / f"{name}.mp4", crops(panorama(seed=number), [8 * k for k in range(20)]))
+    images, _ = take(ask(tmp_path / "out", tmp_path))
+    named = {photo.camera for photo in images.images}
+    assert named == {f"film no. {name}" for name in ("航拍一", "航拍二", "a&b's_ü", "café")}
+
+
+def test_copies_of_a_film_are_left_out_and_named(flight: Path, tmp_path: Path):
+    card = tmp_path / "card"
+    card.mkdir()
+    for name in ("A.MP4", "A (1).MP4", "B.MP4"):
+        shutil.copy(flight, card / name)
+    (card / "B.SRT").write_text("")
+    write_film(card / "C.MP4", crops(panorama(seed=5), LEFTS))
+    images, said = take(ask(tmp_path / "out", card))
+    assert {photo.camera.rpartition(" ")[2] for photo in images.images} == {"B", "C"}
+    assert all(f"{card / name}: not used, is a copy of {card / 'B.MP4'}" in said for name in ("A.MP4", "A (1).MP4"))
+    (card / "B.SRT").unlink()
+    images, _ = take(ask(tmp_path / "other", card))
+    assert {photo.camera.rpartition(" ")[2] for photo in images.images} == {"A", "C"}
+    assert [photo.name for photo in take(ask(tmp_path / "other", card))[0].images] == [p.name for p in images.images]
+    assert film_changes(tmp_path / "other") == ""
 
 
 def test_films_beside_photographs_are_named_and_used_where_they_are_named(
@@ -313,7 +386,9 @@ def test_a_stop_while_frames_are_taken_leaves_an_output_that_goes_on(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     run = RunFolder(tmp_path / "run")
-    request = ask(run.own_capture, Path(shutil.copy(flight, tmp_path / "a.mp4")), flight)
+    other = tmp_path / "a.mp4"
+    other.write_bytes(flight.read_bytes() + b"\0\0\0\x08free")
+    request = ask(run.own_capture, other, flight)
     look, left = take_frames._look, [1]
 
     def stop(*arguments):
@@ -357,7 +432,8 @@ def test_a_look_at_what_is_begun_takes_the_frames_that_are_there(flight: Path, t
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*")} == before
 
 
-def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path):
+@pytest.mark.parametrize("coding", ["utf-8", "utf-16", "utf-8-sig"])
+def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path, coding: str):
     film = tmp_path / "DJI_2.MOV"
     moments = [0.1 * k + (0.7 if k > 15 else 0) for k in range(30)]
     write_film(film, crops(panorama(), [5 * k for k in range(30)]), moments=moments)
@@ -366,7 +442,10 @@ def test_sidecar_subtitles_uneven_frames_and_no_positions(tmp_path: Path):
     assert [photo.lat_lon for photo in images.images] == [None] * len(images.images)
     times = [f"00:00:{int(t):02d},{round(1000 * (t % 1)):03d}" for t in moments]
     blocks = [f"{k}\n{at} --> {at}\n[latitude: {47 + k * 1e-5:.6f}] [longitude: 8.2]\n" for k, at in enumerate(times)]
-    (tmp_path / "dji_2.SRT").write_text("\n".join(blocks))
+    (tmp_path / "dji_2.SRT").write_text("Signal: 4\n".join(block.partition("[")[0] for block in blocks))
+    _, said = take(ask(tmp_path / "none", film))
+    assert "no positions: none is understood in dji_2.SRT" in said
+    (tmp_path / "dji_2.SRT").write_text("\n".join(blocks), encoding=coding)
     images, said = take(ask(tmp_path / "two", film))
     assert "positions of dji_2.SRT" in said
     for photo in images.images:
@@ -385,10 +464,14 @@ def test_subtitles_of_other_times_give_no_positions_and_are_named(tmp_path):
     assert "no positions: those of DJI_2.SRT are of other times (5 min 00 s to 5 min 02 s)" in said
 
 
-def test_a_film_that_lies_on_its_side_becomes_upright(tmp_path: Path):
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_film_that_lies_on_its_side_becomes_upright(tmp_path: Path, quarters: int):
     upright = crops(panorama(), [6 * k for k in range(20)])
-    write_film(tmp_path / "a.mp4", [np.rot90(each) for each in upright], rotation=-90)
-    images, _ = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    turned = [np.rot90(each, quarters) for each in upright]
+    write_film(tmp_path / "a.mp4", turned, rotation={1: -90, 2: 180, 3: 90}[quarters])
+    images, said = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    assert ", 200 x 160; " in said
+    assert len(images.images) >= 4
     for photo in images.images:
         number = int(photo.path.stem.rpartition("_")[2])
         pixels = np.asarray(Image.open(photo.path)).astype(float)

@@ -345,6 +345,32 @@ def test_pictures_twice_as_wide_as_high_without_a_lens_are_remarked(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "size", "stitched"),
+    [
+        ("DJI_0003-Pano.jpg", (300, 130), True), ("DJI_0003_pano-2.jpg", (560, 160), True),
+        ("PANO0001.JPG", (130, 300), True), ("DJI_0099.JPG", (960, 240), True),
+        ("DJI_0098.JPG", (320, 140), False), ("Panorama_0001.JPG", (320, 240), False),
+    ],
+)  # fmt: skip
+def test_long_pictures_with_the_tags_of_one_photograph_are_left_out_where_name_or_size_say_stitched(
+    tmp_path, name, size, stitched
+):
+    names = [f"DJI_{k:04d}.JPG" for k in range(COUNT)]
+    for k, each in enumerate(names):
+        write_photograph(tmp_path / each, pixels(k, 320, 240), k, np.array((10.0 * k, 0.0, 40.0)))
+    write_photograph(tmp_path / name, pixels(77, *size), 77, np.zeros(3))
+    found = collect_images([tmp_path])
+    assert [each.name for each in found.excluded if "is stitched" in each.reason] == [name] * stitched
+    assert {photo.name for photo in found.images} == {*names, *([] if stitched else [name])}
+
+
+def test_flights_of_long_pictures_alone_are_used(tmp_path):
+    for k in range(COUNT):
+        write_photograph(tmp_path / f"pano_{k}.JPG", pixels(k, 280, 120), k, np.array((10.0 * k, 0.0, 40.0)))
+    assert len(collect_images([tmp_path]).images) == COUNT
+
+
 def test_panoramas_are_named(tmp_path):
     names = flight(tmp_path)
     write_photograph(tmp_path / "PANO_0001.JPG", pixels(77, 240, 120), 77, np.zeros(3))

@@ -16,6 +16,7 @@ from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import BODY, GIMBAL, ImageMetadata, looks_backwards
 from vdgs.sfm.other_cameras import other_cameras
 from vdgs.sfm.photograph_versions import versions
+from vdgs.sfm.stitched_pictures import stitched
 
 #: Focal lengths within this share of each other are one.
 ONE_FOCAL = 0.02
@@ -187,7 +188,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     A picture without any tags is a stray only where most others have them and no file beside it says its place, and has
     lost its tags where half do; where fewer do, it is said what it may be.
     """
-    reasons = other_cameras(photographs)
+    reasons = other_cameras(photographs) | stitched(photographs)
     reasons |= versions([photo for photo in photographs if photo.name not in reasons])
     tagged = [photo for photo in photographs if not photo.is_bare]
     bare = [photo for photo in photographs if photo.is_bare and photo.name not in reasons]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from itertools import islice
+from xml.sax.saxutils import unescape
 
 from vdgs.captures.xmp_packets import as_utf8
 
@@ -31,6 +32,8 @@ _ELSEWHERE = re.compile(
 _BAND = re.compile(
     r"<(Camera:BandName)>\s{0,200}<rdf:(?:Seq|Bag)>((?:\s{0,200}<rdf:li>[^<]{0,100}</rdf:li>){1,8})\s{0,200}</rdf:(?:Seq|Bag)>"
 )
+#: What XML writes for quotes, besides `&lt;`, `&gt;` and `&amp;`.
+_QUOTES = {"&quot;": '"', "&apos;": "'"}
 _ITEM = re.compile(r"<rdf:li>([^<]{0,100})<")
 
 
@@ -72,7 +75,8 @@ def _values(text: str) -> Iterator[tuple[str, str, str]]:
     for pattern in (_ATTRIBUTE, _ELEMENT):
         for match in pattern.finditer(text):
             prefix, name, *values = match.groups()
-            yield prefix, name, next((each for each in values if each is not None), "").strip()
+            value = next((each for each in values if each is not None), "").strip()
+            yield prefix, name, unescape(value, _QUOTES)
 
 
 def text(values: Mapping[str, str], *names: str) -> str:

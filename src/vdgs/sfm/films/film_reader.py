@@ -15,9 +15,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from vdgs.captures.name_resolution import to_nfc
+from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
 from vdgs.sfm.films.high_dynamic_range import HDR_TRANSFERS, to_standard_range
-from vdgs.sfm.films.telemetry import Telemetry, read_subtitles, read_telemetry
+from vdgs.sfm.films.telemetry import Telemetry, places, read_subtitles, read_telemetry
 from vdgs.sfm.image_metadata import MIN_SIDE_PX
 from vdgs.system.quoting import shell_word
 
@@ -106,15 +108,22 @@ class Film:
             self.subtitles.append((float(packet.pts * packet.time_base), words.decode("utf-8", errors="replace")))
 
     def telemetry(self) -> tuple[tuple[Telemetry, ...], str]:
-        """What its subtitles say, once its frames were read, or else the file of subtitles beside it; and which."""
-        records = read_telemetry(self.subtitles, self.place)
-        if records:
-            return records, "its subtitles"
-        for file in sorted(self.path.parent.glob("*.[sS][rR][tT]")):
-            if file.stem.lower() == self.path.stem.lower():
-                text = file.read_bytes().decode("utf-8-sig", errors="replace")
-                return read_telemetry(read_subtitles(text), self.place), file.name
-        return (), ""
+        """What its subtitles say, once its frames were read, or else the file of subtitles beside it; and which, also
+        where they say nothing; empty where there are none."""
+        found = [(read_telemetry(self.subtitles, self.place), "its subtitles")] if self.subtitles else []
+        if not any(any(places(records)) for records, _ in found):
+            found += [
+                (read_telemetry(read_subtitles(decode_text(file.read_bytes())), self.place), file.name)
+                for file in subtitle_files(self.path)
+            ]
+        found.sort(key=lambda each: (not any(places(each[0])), not each[0]))
+        return found[0] if found else ((), "")
+
+
+def subtitle_files(film: Path) -> list[Path]:
+    """The files of subtitles beside a film: of its name in any case."""
+    stem = to_nfc(film.stem).lower()
+    return [file for file in sorted(film.parent.glob("*.[sS][rR][tT]")) if to_nfc(file.stem).lower() == stem]
 
 
 @contextmanager
@@ -221,6 +230,12 @@ def shrink(gray: UInt8[np.ndarray, "h w"], width: int) -> UInt8[np.ndarray, "h w
     if gray.shape[1] <= width:
         return gray
     return cv2.resize(gray, (width, max(1, round(gray.shape[0] * width / gray.shape[1]))), interpolation=cv2.INTER_AREA)
+
+
+def upright_size(picture: Any) -> tuple[int, int]:
+    """Width and height of the picture once it is turned as the film says."""
+    size = picture.width, picture.height
+    return size[::-1] if round(picture.rotation / 90) % 2 else size
 
 
 def color_picture(picture: Any) -> UInt8[np.ndarray, "h w 3"]:

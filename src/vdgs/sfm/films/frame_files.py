@@ -6,6 +6,7 @@ import io
 from datetime import datetime
 from fractions import Fraction
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import UInt8
@@ -31,8 +32,9 @@ def encode_frame(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 def with_tags(jpeg: bytes, film: str, camera: tuple[str, str], moment: datetime | None, known: Telemetry) -> bytes:
     """The JPEG file with EXIF and XMP. The film stands for the serial number of its camera: the lens of each is found
-    on its own, as films are cut from different parts of a sensor."""
-    segments = b"".join(_segment(part) for part in (_exif(film, camera, moment, known), _xmp(known)) if part)
+    on its own, as films are cut from different parts of a sensor. EXIF's text is ASCII: other names stand in XMP."""
+    in_exif, in_xmp = (film, "") if film.isascii() else ("", film)
+    segments = b"".join(_segment(part) for part in (_exif(in_exif, camera, moment, known), _xmp(in_xmp, known)) if part)
     return jpeg[:2] + segments + jpeg[2:]
 
 
@@ -46,7 +48,7 @@ def _exif(film: str, camera: tuple[str, str], moment: datetime | None, known: Te
     if make:
         exif[0x010F] = make
     exif[0x0110] = model or UNKNOWN_FILM_CAMERA
-    details: dict[int, Any] = {0xA431: film}
+    details: dict[int, Any] = {0xA431: film} if film else {}
     if moment is not None:
         details[0x9003] = f"{moment:%Y:%m:%d %H:%M:%S}"
         details[0x9291] = f"{moment.microsecond // 1000:03d}"
@@ -79,13 +81,15 @@ def _rational(value: float, parts: int) -> IFDRational:
     return IFDRational(Fraction(round(value * parts), parts))
 
 
-def _xmp(known: Telemetry) -> bytes:
+def _xmp(film: str, known: Telemetry) -> bytes:
     values = {} if known.relative_altitude is None else {"RelativeAltitude": known.relative_altitude}
     if known.gimbal is not None:
         values |= dict(zip(("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"), known.gimbal, strict=True))
-    if not values:
+    written = {name: f"{value:+.3f}" for name, value in values.items()}
+    written |= {"CameraSerialNumber": film} if film else {}
+    if not written:
         return b""
-    attributes = " ".join(f'drone-dji:{name}="{value:+.3f}"' for name, value in values.items())
+    attributes = " ".join(f"drone-dji:{name}={quoteattr(value)}" for name, value in written.items())
     return (
         _XMP_HEADER
         + (

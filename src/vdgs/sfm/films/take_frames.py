@@ -23,7 +23,16 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.sfm.films.film_reader import Film, FilmFrame, color_picture, gray_picture, open_film, shrink
+from vdgs.sfm.films.film_reader import (
+    Film,
+    FilmFrame,
+    color_picture,
+    gray_picture,
+    open_film,
+    shrink,
+    subtitle_files,
+    upright_size,
+)
 from vdgs.sfm.films.frame_choice import MOTION_WIDTH, SHARPNESS_WIDTH, FrameChooser, MotionTracker, sharpness
 from vdgs.sfm.films.frame_files import encode_frame, with_tags
 from vdgs.sfm.films.telemetry import Telemetry, places, telemetry_at
@@ -32,7 +41,7 @@ from vdgs.sfm.image_list import MIN_IMAGES
 from vdgs.sfm.reconstruction_plan import check_output_folder
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes, write_json
-from vdgs.system.content_digests import ContentDigests
+from vdgs.system.content_digests import ContentDigests, find_copies
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.stop_signals import check_stop_requested
@@ -69,7 +78,7 @@ def temporary_frames(request: SfmRequest, console: Console) -> Iterator[SfmReque
     Raises CaptureError for films that cannot be read or show no way, VdgsError for an output that is something else, or
     was begun with other films.
     """
-    films = films_in(request.image_folders)
+    films, _ = _films(request)
     if not films:
         yield request
         return
@@ -91,7 +100,7 @@ def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = N
     Raises CaptureError for films that cannot be read or show no way, VdgsError for films that are others than those a
     capture was begun with.
     """
-    films = films_in(request.image_folders)
+    films, _ = _films(request)
     if not films:
         return request
     check_ranges(request)
@@ -102,6 +111,23 @@ def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = N
         _check_same(request, films, digests)
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
         return replace(request, image_folders=_take(request, request.output, console, digests))
+
+
+def _films(request: SfmRequest) -> tuple[list[Path], dict[Path, Path]]:
+    """The films that are asked for, and those that are copies of one of them, byte for byte, with that one: the one
+    with subtitles beside it, else that of the shortest name (not `DJI_0001 (1).MP4`)."""
+    films, copies = films_in(request.image_folders), dict[Path, Path]()
+    try:
+        for group in find_copies(films):
+            first, *others = sorted((films[k] for k in group), key=_copy_order)
+            copies |= dict.fromkeys(others, first)
+    except OSError as error:
+        raise CaptureError(f"{error.filename}: cannot be read ({error.strerror}). Copy the film again.") from None
+    return [film for film in films if film not in copies], copies
+
+
+def _copy_order(film: Path) -> tuple[bool, int]:
+    return not subtitle_files(film), len(film.name)
 
 
 def _check_same(request: SfmRequest, films: Sequence[Path], digests: ContentDigests) -> None:
@@ -157,7 +183,7 @@ def _take(
 ) -> tuple[Path, ...]:
     """The folders of photographs: those of the request, and the folder of frames; without `digests` nobody asks later
     whether films are others."""
-    films, folder = films_in(request.image_folders), output / FRAMES_FOLDER
+    (films, copies), folder = _films(request), output / FRAMES_FOLDER
     names, before = _folder_names(films), _records(output)
     most = _bounds(films, request.options.num_frames)
     for rest in folder.iterdir() if folder.is_dir() else ():
@@ -171,6 +197,8 @@ def _take(
         if name in names and (folder / name).is_dir() and record.is_of(bounds[name][0], content, bounds[name][1])
     }
     _write_records(output, records)
+    for film, first in copies.items():
+        console.print(escape(f"{film}: not used, is a copy of {first}"), highlight=False)
     for name, (film, bound) in bounds.items():
         if name not in records:
             taken = _take_frames(film, folder / name, bound, Workspace(output / WORK_FOLDER), console)
@@ -256,7 +284,7 @@ def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: 
         for file in chosen:
             known = telemetry_at(records, moments[file])
             placed += known.lat_lon is not None
-            moment = _moment(film, records, known, moments[file])
+            moment = _moment(film, known, moments[file])
             write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
         summary = _summary(film, len(chosen), placed, last, records, source)
     return FilmRecord(film=str(path.resolve()), most=most, frames=len(chosen), summary=summary)
@@ -277,18 +305,19 @@ def _look(film: Film, chooser: FrameChooser[FilmFrame], tell) -> FilmFrame:  # t
     return frame
 
 
-def _moment(film: Film, records: Sequence[Telemetry], known: Telemetry, seconds: float) -> datetime | None:
-    """When a frame was taken; of films that do not say when they were begun, in the order of the frames."""
-    if any(record.moment for record in records):
-        return known.moment
-    return film.created and film.created + timedelta(seconds=seconds)
+def _moment(film: Film, known: Telemetry, seconds: float) -> datetime | None:
+    """When a frame was taken, by the subtitles, else by when the film was begun."""
+    return known.moment or (film.created and film.created + timedelta(seconds=seconds))
 
 
 def _summary(film: Film, count: int, placed: int, last: FilmFrame, records: Sequence[Telemetry], source: str) -> str:
     """96 of 2,400 frames of 1 min 20 s, 3840 x 2160; positions of its subtitles."""
-    size = f"{film.stream.width} x {film.stream.height}"
+    width, height = upright_size(last.picture)
+    size = f"{width} x {height}"
     said = f"positions of {source}" + (f" for {placed} of the frames" if placed < count else "")
-    if not any(places(records)):
+    if not any(places(records)) and source:
+        said = f"no positions: none is understood in {source} (without GPS, or without a fix?); give a table with --gps"
+    elif not any(places(records)):
         said = "no positions"
         said += " (drones write them into subtitles where captions are switched on; or give a table with --gps)"
     elif not placed:

@@ -13,13 +13,15 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from itertools import pairwise
 
 from vdgs.captures.angles import LIMITS, side_of
 from vdgs.captures.table_columns import FOOT_M
 
-#: Between records that are farther apart than this (seconds) nothing is known.
+#: Between records that are farther apart than this (seconds) nothing is interpolated.
 MAX_GAP_S = 3.0
-#: Before the first record and after the last these count for so many seconds: as far as firmwares' records are apart.
+#: Before the first record, after the last and at the ends of a longer gap these count for so many seconds: as far as
+#: firmwares' records are apart.
 MAX_OUTSIDE_S = 1.0
 #: A number of a list; one that stands alone, whose comma is that of decimals; and one with its unit.
 _NUMBER = r"([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"
@@ -87,41 +89,83 @@ def read_telemetry(
     what the film says of where it was begun: it decides the order of two numbers without names."""
     found = [_read(seconds, _TAGS.sub(" ", words)) for seconds, words in blocks]
     latitude_first = _latitude_first([pair for _, pair in found if pair is not None], place)
-    records = []
+    records = list[Telemetry]()
     for record, pair in found:
         if pair is not None:
             numbers = pair.numbers if latitude_first else pair.numbers[::-1]
             record = replace(record, lat_lon=_place(*numbers))
         if any(value is not None for name, value in vars(record).items() if name != "seconds"):
             records.append(record)
-    return tuple(sorted(records, key=lambda record: record.seconds))
+    records.sort(key=lambda record: record.seconds)
+    return _on_one_clock(records)
+
+
+def _on_one_clock(records: Sequence[Telemetry]) -> tuple[Telemetry, ...]:
+    """The records, with the moments of one clock that runs as the film does where their own do not rise from record to
+    record: of those that are written in whole seconds on each frame, the frames of a second have no order."""
+    clocked = [record for record in records if record.moment is not None]
+    moments = [record.moment for record in clocked if record.moment is not None]
+    if all(one < other for one, other in pairwise(moments)):
+        return tuple(records)
+    starts = sorted(moment - timedelta(seconds=record.seconds) for moment, record in zip(moments, clocked, strict=True))
+    cut_off = timedelta(seconds=0 if any(moment.microsecond for moment in moments) else 0.5)  # what is, in the median
+    start = starts[len(starts) // 2] + cut_off
+    return tuple(
+        record if record.moment is None else replace(record, moment=start + timedelta(seconds=record.seconds))
+        for record in records
+    )
 
 
 def telemetry_at(records: Sequence[Telemetry], seconds: float) -> Telemetry:
     """What is known at a moment: positions and heights between those of the records around it, all else as the record
-    before it has."""
-    if not records:
-        return Telemetry(seconds=seconds)
-    after = bisect_right([record.seconds for record in records], seconds)
-    one, other = records[max(0, after - 1)], records[min(after, len(records) - 1)]
-    outside = max(records[0].seconds - seconds, seconds - records[-1].seconds)
-    if abs(one.seconds - seconds) > MAX_GAP_S or outside > MAX_OUTSIDE_S:
-        return Telemetry(seconds=seconds)
-    span = other.seconds - one.seconds
-    share = (seconds - one.seconds) / span if 0 < span <= MAX_GAP_S else 0.0
-    place = one.lat_lon
-    if one.lat_lon is not None and other.lat_lon is not None:
-        (latitude, longitude), (next_latitude, next_longitude) = one.lat_lon, other.lat_lon
-        east = _wrapped(next_longitude - longitude)
-        place = latitude + share * (next_latitude - latitude), _wrapped(longitude + share * east)
+    before it has. Where any record has a place, those without one (the drone had no fix) say no height either."""
+    around = _around(records, seconds)
+    known = Telemetry(seconds=seconds, moment=_moment_at(records, seconds))
+    if around is None:
+        return known
+    known = replace(known, focal_35mm=around[0].focal_35mm, gimbal=around[0].gimbal)
+    placed = _around([record for record in records if record.lat_lon is not None] or records, seconds)
+    if placed is None:
+        return known
+    one, other, share = placed
     return replace(
-        one,
-        seconds=seconds,
-        lat_lon=place,
+        known,
+        lat_lon=_place_between(one.lat_lon, other.lat_lon, share),
         altitude=_between(one.altitude, other.altitude, share),
         relative_altitude=_between(one.relative_altitude, other.relative_altitude, share),
-        moment=one.moment and one.moment + timedelta(seconds=seconds - one.seconds),
     )
+
+
+def _around(records: Sequence[Telemetry], seconds: float) -> tuple[Telemetry, Telemetry, float] | None:
+    """The records before and after a moment, and the share of the way between them; in a longer gap and outside of all
+    twice the nearest, None where that is far."""
+    if not records:
+        return None
+    after = bisect_right(records, seconds, key=lambda record: record.seconds)
+    one, other = records[max(0, after - 1)], records[min(after, len(records) - 1)]
+    span = other.seconds - one.seconds
+    if 0 < span <= MAX_GAP_S:
+        return one, other, (seconds - one.seconds) / span
+    nearest = min(one, other, key=lambda record: abs(record.seconds - seconds))
+    return (nearest, nearest, 0.0) if abs(nearest.seconds - seconds) <= MAX_OUTSIDE_S else None
+
+
+def _moment_at(records: Sequence[Telemetry], seconds: float) -> datetime | None:
+    """By the clock of the last record with one before the moment, else of the first: the film runs on in gaps."""
+    clocked = [record for record in records if record.moment is not None]
+    if not clocked:
+        return None
+    record = clocked[max(0, bisect_right(clocked, seconds, key=lambda record: record.seconds) - 1)]
+    return record.moment and record.moment + timedelta(seconds=seconds - record.seconds)
+
+
+def _place_between(
+    one: tuple[float, float] | None, other: tuple[float, float] | None, share: float
+) -> tuple[float, float] | None:
+    if one is None or other is None:
+        return None
+    east = _wrapped(other[1] - one[1])
+    return one[0] + share * (other[0] - one[0]), _wrapped(one[1] + share * east)
 
 
 def _wrapped(degrees: float) -> float:
