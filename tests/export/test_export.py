@@ -145,6 +145,49 @@ def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Pa
     assert torch.allclose(plain.means, local_bake.means, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("crs", "note"),
+    [("EPSG:32733", "made for .*lies outside"), ("EPSG:31468", "datum shift|lies outside"), ("EPSG:32632", None)],
+)
+def test_what_a_map_says_of_its_system_files_say_too(export, tmp_path: Path, monkeypatch, crs, note):
+    pytest.importorskip("pyproj")
+    said = io.StringIO()
+    monkeypatch.setattr(sys.modules[__name__], "QUIET", Console(file=said, width=1000))
+    files = export("a.points.ply", "b.splat", "tileset.json", origin=PLACE, crs=crs)["files"]
+    placement = MapProjection.of(ground(PLACE), crs)
+    assert bool(placement.notes) == (note is not None)
+    assert all(re.search(note, each) for each in placement.notes[-1:])
+    assert f"a.points.ply, b.splat: {placement.name}; heights {placement.height_reference}\n" in said.getvalue()
+    for file in files[:2]:
+        assert (file["crs_name"], file["heights"]) == (placement.name, placement.height_reference)
+        assert file["notes"][: len(placement.notes)] == list(placement.notes)
+    for each in placement.notes:  # once for all files
+        assert said.getvalue().count(each) == 1
+        assert each not in files[2]["notes"]  # on the globe, whatever the map
+    assert "horizon plane" in files[2]["heights"]
+
+
+def test_the_usual_system_is_named(export, tmp_path: Path):
+    pytest.importorskip("pyproj")
+    (on_map,) = export("a.points.ply", origin=PLACE, crs="EPSG:25832")["files"]
+    (as_usual,) = export("a.points.ply", origin=PLACE)["files"]
+    (nowhere,) = export("a.points.ply")["files"]
+    assert "ellipsoidal (WGS 84), if the altitudes" in on_map["heights"]
+    assert "east, north, up about latitude" in as_usual["crs_name"]
+    assert "ground frame" in nowhere["crs_name"]
+
+
+def test_earth_centered_coordinates_are_for_points_alone(export, tmp_path: Path):
+    """Nothing stands upright in them: what is shown would lie on its side."""
+    pytest.importorskip("pyproj")
+    for name, asked in (("a.ply", {}), ("a.spz", {}), ("a.html", {}), ("a.points.ply", {"axes": "y-up"})):
+        with pytest.raises(VdgsError, match=r"4978: the third axis .* does not point up here.*\.points\.ply"):
+            export(name, origin=PLACE, crs="EPSG:4978", **asked)
+        assert not (tmp_path / name).exists()
+    export("a.points.ply", "tileset.json", origin=PLACE, crs="EPSG:4978")
+    assert b"comment axes x to latitude 0 longitude 0, y to" in (tmp_path / "a.points.ply").read_bytes()[:3000]
+
+
 def test_a_program_gets_its_file_turned_and_placed(export, tmp_path: Path):
     export("plain.ply", sh_degree=1)
     plain = registry.read_gaussians(tmp_path / "plain.ply")

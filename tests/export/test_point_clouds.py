@@ -37,6 +37,43 @@ def test_points_stand_where_the_map_says(tmp_path, ending):
     np.testing.assert_allclose(read_colors, shown, atol=0.5 / 255 + 1e-6)
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["EPSG:32632", "EPSG:2056", "EPSG:4978", "EPSG:2263", "EPSG:31467", "EPSG:32761", "EPSG:25832+7837", "EPSG:7415",
+     "+proj=utm +zone=33 +ellps=bessel +towgs84=1,2,3,0,0,0,0 +units=m +type=crs"],
+)  # fmt: skip
+def test_las_holds_its_system_as_the_standard_asks(tmp_path, name):
+    """WKT 1 (OGC 01-009) in record 2112, which programs without PROJ look for; x stays east where EPSG has north
+    first."""
+    pyproj = pytest.importorskip("pyproj")
+    given = pyproj.CRS.from_user_input(name)
+    registry.write_scene(tmp_path / "a.las", ExportScene.of(random_gaussians(5, 0), ExportMetadata(ORIGIN, name)))
+    header = laspy.read(tmp_path / "a.las").header
+    (record,) = header.vlrs
+    assert header.global_encoding.wkt
+    assert (record.user_id, record.record_id) == ("LASF_Projection", 2112)
+    assert record.string.startswith(("PROJCS[", "GEOCCS[", "COMPD_CS["))
+    read = header.parse_crs()
+    assert (read.is_compound, read.is_bound) == (given.is_compound, given.is_bound)
+    first = [axis.direction for axis in read.axis_info]
+    if [axis.direction for axis in given.axis_info][:2] == ["north", "east"]:
+        assert first == ["east", "north"]
+    else:
+        assert read.equals(given)
+    there = pyproj.Transformer.from_crs(read, given, always_xy=True).transform(*ORIGIN)
+    np.testing.assert_allclose(there, ORIGIN, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["EPSG:8857", "3d"])
+def test_las_holds_what_wkt_1_cannot_say_as_wkt_2(tmp_path, name):
+    pyproj = pytest.importorskip("pyproj")
+    given = pyproj.CRS(32632).to_3d() if name == "3d" else pyproj.CRS(name)
+    scene = ExportScene.of(random_gaussians(5, 0), ExportMetadata(ORIGIN, given.to_wkt()))
+    notes = registry.write_scene(tmp_path / "a.las", scene)
+    assert any("WKT 2" in note and given.name in note for note in notes)
+    assert laspy.read(tmp_path / "a.las").header.parse_crs().equals(given)
+
+
 def test_without_a_map_coordinates_are_local(tmp_path):
     some = random_gaussians(20, 0)
     registry.write_scene(tmp_path / "a.laz", ExportScene.of(some))

@@ -195,6 +195,37 @@ def test_systems_to_the_east_and_north_are_no_mirror(crs, origin):
     assert np.linalg.det(placement.similarity_at(np.zeros(3)).rotation) > 0
 
 
+@pytest.mark.parametrize(
+    ("crs", "origin"),
+    [
+        ("EPSG:32632", BERN), ("EPSG:2056", BERN), ("EPSG:31467", (48.1, 9.4, 300.0)), ("EPSG:3857", BERN),
+        ("EPSG:3995", (46.8, -92.0, 200.0)), (None, (-85.0, 170.0, 10.0)), (None, (86.0, 19.0, 10.0)),
+        ("EPSG:3031", (-77.8, 166.7, 10.0)), ("EPSG:27700", (51.5, -0.1, 30.0)),
+    ],
+)  # fmt: skip
+def test_north_and_lengths_are_those_of_the_projection(crs, origin):
+    """The meridian convergence counts from north to grid north: north lies the other way."""
+    ground = frame(origin)
+    placement, middle = MapProjection.of(ground, crs), np.array([300.0, -200.0, 0.0])
+    latitude, longitude, height = geodetic_from_enu(middle[None], origin)[0]
+    factors = pyproj.Proj(placement.crs).get_factors(longitude, latitude)
+    off = (placement.true_north(ground, middle) + factors.meridian_convergence + 180) % 360 - 180
+    assert abs(off) < 0.01
+    areal = np.sqrt(factors.areal_scale) * (1 - height / 6.37e6)
+    assert placement.stretch_at(middle) == pytest.approx(areal, rel=3e-4)  # of the system's own ellipsoid
+
+
+def test_north_by_other_axes():
+    ground, place = frame(), np.zeros(3)
+    for crs, north_deg in (("enu", 0), ("local", 0), ("source", 90)):  # the capture's own x is north
+        assert MapProjection.of(ground, crs).true_north(ground, place) == pytest.approx(north_deg)
+    nowhere = frame(None)
+    assert MapProjection.of(nowhere, "source").true_north(nowhere, place) is None
+    assert MapProjection.of(nowhere, "source").stretch_at(place) == pytest.approx(1.0)
+    unknown = frame(None, metric=False)
+    assert MapProjection.of(unknown, "source").stretch_at(place) == 1.0
+
+
 @pytest.mark.parametrize("metric", [True, False])
 def test_without_a_georeference_there_is_the_ground_frame_and_the_source(metric):
     ground = frame(None, metric=metric)

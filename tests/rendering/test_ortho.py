@@ -403,10 +403,28 @@ def test_lines_of_a_grid_are_at_multiples_of_its_pixels():
     assert (on_lines.width, on_lines.height) == (6, 4)
 
 
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:3995", "local"])
+def test_the_arrow_leads_north_and_the_bar_is_as_long_as_on_the_ground(house, make, monkeypatch, crs):
+    """On a polar map far from its pole north is no longer the top of the sheet, and lengths are not those of the
+    ground."""
+    kept = []
+    monkeypatch.setattr(previews, "write_png", lambda figure, file: (kept.append(figure), file.touch()))
+    noted = json.loads((make(*house, gsd=0.5, crs=crs) / "map.json").read_text())
+    placement = MapProjection.of(house[0].ground, crs)
+    assert noted["north_deg"] == pytest.approx(placement.true_north(house[0].ground, np.zeros(3)), abs=0.01)
+    assert (abs(noted["north_deg"]) > 5) is (crs == "EPSG:3995")
+    panel = kept[0].axes[0]
+    arrow = next(each for each in panel.texts if each.get_text() == "N")
+    ahead = panel.transData.transform(arrow.xy) - panel.transData.transform(arrow.xyann)
+    assert np.degrees(np.arctan2(*ahead)) == pytest.approx(noted["north_deg"], abs=0.5)
+    length = next(float(text.get_text().split()[0]) for text in panel.texts if text.get_text().endswith(" m"))
+    assert sum(part.get_width() for part in panel.patches) == pytest.approx(length * noted["stretch"])
+
+
 def test_light_of_a_hillshade():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
     assert hillshade(np.zeros((5, 5)), 1.0) == pytest.approx(np.sin(np.pi / 4))
-    # Rising to the south-east, a slope looks at the sun in the north-west; the same in pixels of another size.
+    # Rising to the south-east, a slope looks at the sun at the upper left; the same in pixels of another size.
     facing, away = hillshade(0.3 * (x + y), 1.0), hillshade(-0.3 * (x + y), 1.0)
     assert facing.min() > 0.9 > 0.5 > away.max()
     np.testing.assert_allclose(hillshade(0.6 * (x + y), 2.0), facing)

@@ -104,6 +104,17 @@ def test_nothing_is_in_metres_where_the_unit_is_unknown(tmp_path):
     assert "The direction of north is not known." in text
 
 
+def test_the_arrow_over_the_map_leads_north_and_lengths_are_those_of_the_ground(tmp_path):
+    run = run_of(tmp_path / "run", place_of(tmp_path / "beach", GEOREF))
+    file = run.path / "maps/map.json"
+    noted = json.loads(file.read_text())
+    file.write_text(json.dumps({**noted, "north_deg": 92.04, "stretch": 2.0}))
+    source, text = page_of(run)
+    assert '<div class="north" style="--north:92.0deg">N</div>' in source
+    assert '<div class="bar" style="width:22.222%">1 m</div>' in source  # 4.5 m on the ground
+    assert "6.75 m² mapped" in text
+
+
 def test_the_report_opens_with_the_place_then_pictures_then_metrics(tmp_path):
     source, text = page_of(run_of(tmp_path / "run", place_of(tmp_path / "beach", GEOREF)))
     order = [source.index(part) for part in ("<h1>beach", 'class="sheet"', "Photographs<", '"views"', '"metrics"')]

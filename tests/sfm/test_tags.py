@@ -209,6 +209,29 @@ def test_the_reference_that_xmp_names_is_that_of_its_own_altitude(in_exif, words
     assert ("differs from AbsoluteAltitude in XMP (RtkAlt)" in reference) is (in_exif == 525)
 
 
+@pytest.mark.parametrize(
+    ("gps", "xmp", "found"),
+    [
+        ({}, 'drone-dji:AbsoluteAltitude="+545.00"', (545.0, "AbsoluteAltitude in XMP as recorded, datum not stated")),
+        ({6: R(0, 0)}, 'drone-dji:AbsoluteAltitude="+545.00"',
+         (545.0, "AbsoluteAltitude in XMP as recorded, datum not stated")),
+        ({}, 'drone-dji:AbsoluteAltitude="+545.00" drone-dji:AltitudeType="RtkAlt"',
+         (545.0, "AbsoluteAltitude in XMP (RtkAlt) as recorded")),
+        ({5: b"\2", 6: 120.0}, "", (120.0, "EXIF GPSAltitude, above sea level (GPSAltitudeRef) as recorded")),
+        ({5: b"\3", 6: 120.0}, "", (-120.0, "EXIF GPSAltitude, above sea level (GPSAltitudeRef) as recorded")),
+        ({}, 'exif:GPSAltitude="12/1" exif:GPSAltitudeRef="2"',
+         (12.0, "exif:GPSAltitude in XMP, above sea level (GPSAltitudeRef) as recorded")),
+        ({5: b"\0", 6: 120.0}, "", (120.0, "EXIF GPSAltitude as recorded, datum not stated")),
+        ({5: 2, 6: 500.0}, 'drone-dji:AbsoluteAltitude="+525.00"',
+         (500.0, "EXIF GPSAltitude, above sea level (GPSAltitudeRef) as recorded, which differs from AbsoluteAltitude "
+          "in XMP")),
+    ],
+)  # fmt: skip
+def test_an_altitude_names_where_it_stands_and_its_reference(gps, xmp, found):
+    """EXIF 3.0 tells the sea (2, 3) from the ellipsoid; its 0 and 1 are those of EXIF 2, which meant the sea."""
+    assert read_altitude(gps, packet(xmp)) == found
+
+
 def test_an_altitude_gives_way_to_no_default_and_not_where_another_source_confirms_it():
     heights = 'drone-dji:RelativeAltitude="+50.1" drone-dji:AbsoluteAltitude='
     for xmp in ('"+0.00"', '"+90.00" drone-dji:AltitudeWGS84="50.0"'):  # a take-off at the sea

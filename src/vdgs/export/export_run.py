@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from vdgs.export.color_refinement import BakedGaussians
 from vdgs.export.distributed_bake import DistributedBake, distributed_bake, forget_shards
 from vdgs.export.export_loss import measure_loss, views_to_measure
 from vdgs.export.formats import registry
+from vdgs.export.formats.axes import EARTH_CENTERED
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialView
 from vdgs.export.formats.gaussian_store import GaussianStore
 from vdgs.export.gaussian_optimization import optimize_gaussians
@@ -78,7 +79,7 @@ class _BakedScene:
         to_local = frame.points_to_local if registry.format_from_path(path).only_points else frame.to_local
         chunks = (to_local(piece) for piece in self.pieces(rows))
         bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
-        axes = axes_for(path, self.request)
+        axes = EARTH_CENTERED if frame.is_geocentric else axes_for(path, self.request)
         return ExportScene(
             chunks=chunks,
             count=len(rows),
@@ -190,6 +191,7 @@ def write_files(
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
     for path in _all_outputs(request):
         check_takes_files(path.parent)
+    _print_systems(frames, console)
     _tidy(request.output, console)
     began = time.monotonic()
     page = make_initial_view(run, int(request.html_max_mb * 1e6))
@@ -233,6 +235,18 @@ def write_files(
     return record
 
 
+def _print_systems(frames: Mapping[Path, LocalFrame], console: Console) -> None:
+    """Say before the work in which coordinates the files stand, and what is to be known of each system: a choice of
+    `--crs` that was wrong should not be paid for."""
+    files = dict[tuple[str, str, tuple[str, ...]], list[str]]()
+    for path, frame in frames.items():
+        files.setdefault((frame.name, frame.height_reference, frame.notes), []).append(path.name)
+    for (name, heights, notes), names in files.items():
+        console.print(f"{', '.join(names)}: {name}; heights {heights}", markup=False, highlight=False)
+        for note in notes:
+            console.print(f"[yellow]note[/] {escape(note)}", highlight=False)
+
+
 def _write_fitting(
     path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging
 ) -> ExportedFile:
@@ -243,7 +257,7 @@ def _write_fitting(
         scene, rows = replace(scene, spool=merging.merged(count).spool), np.arange(count)
     if not registry.format_from_path(path).only_points and (note := frame.departure_note(scene.spool.means[rows])):
         notes.append(note)
-    return _write(path, scene.scene(frame, rows, path), merging.console, notes)
+    return _write(path, frame, scene.scene(frame, rows, path), merging.console, notes)
 
 
 def _capacity(path: Path, scene: _BakedScene) -> int:
@@ -323,7 +337,7 @@ def _check_written_once(paths: Sequence[Path]) -> None:
             raise VdgsError(f"--output {path} and --output {other}: both write {file}. Choose another folder for one.")
 
 
-def _write(path: Path, scene: ExportScene, console: Console, notes: Sequence[str]) -> ExportedFile:
+def _write(path: Path, frame: LocalFrame, scene: ExportScene, console: Console, notes: Sequence[str]) -> ExportedFile:
     began = time.monotonic()
     lost = [*notes, *registry.write_scene(path, scene)]
     seconds, size = time.monotonic() - began, _size(path)
@@ -331,7 +345,7 @@ def _write(path: Path, scene: ExportScene, console: Console, notes: Sequence[str
     for each in lost:
         console.print(f"[yellow]note[/] {path.name}: {each}", highlight=False)
     return {"file": str(path.resolve()), "gaussians": scene.count, "bytes": size, "seconds": seconds,
-            "notes": lost}  # fmt: skip
+            "crs_name": frame.name, "heights": frame.height_reference, "notes": [*frame.notes, *lost]}  # fmt: skip
 
 
 def _size(path: Path) -> int:

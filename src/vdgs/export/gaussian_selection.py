@@ -15,6 +15,7 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import ExportScene, InitialView
 from vdgs.export.local_frame import MAX_LOCAL_COORDINATE, LocalFrame, default_crs, make_local_frame
+from vdgs.export.programs import axes_for
 from vdgs.geometry.ground_frame import UNKNOWN_UNIT
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.decode_world import gaussian_means
@@ -100,13 +101,22 @@ def frame_for_file(path: Path, run: OpenedRun, request: ExportRequest, center: n
     """The coordinates of a file: those that do not reach far have their origin nearby.
 
     3D Tiles stand on the globe wherever it is known how, whatever --crs says of other files: no map lies between.
+    Raises VdgsError for a scene in Earth-centered coordinates, which would lie on its side: points alone are measured.
     """
     ground, kind = run.capture.ground, registry.format_from_path(path)
     far = min(MAX_LOCAL_COORDINATE, kind.max_coordinate / 2)
     frame = make_local_frame(
         ground, request.crs or default_crs(ground, path), center, far
     )  # which refuses what is no system
-    return make_local_frame(ground, "enu", center, far) if kind.on_globe and ground.origin_geo is not None else frame
+    if kind.on_globe and ground.origin_geo is not None:
+        return make_local_frame(ground, "enu", center, far)
+    if frame.is_geocentric and not (kind.only_points and axes_for(path, request) is None):
+        raise VdgsError(
+            f"--crs {request.crs}: the third axis of {frame.name} does not point up here, and {path.name} needs one "
+            "that does. Leave --crs out, give a projected system, or write .las, .laz or .points.ply (without --axes "
+            "and --for); tileset.json stands on the globe by itself."
+        )
+    return frame
 
 
 def select_rows(

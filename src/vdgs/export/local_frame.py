@@ -37,6 +37,14 @@ class LocalFrame(Similarity):
     facts: ExportMetadata
     #: The map, where it is curved against the ground frame; None where the similarity is exact.
     projection: MapProjection | None = None
+    #: The system, for people.
+    name: str = ""
+    #: What the third coordinate counts from.
+    height_reference: str = ""
+    #: What a person should know of the system: how it is reached, and whether it is made for this place.
+    notes: tuple[str, ...] = ()
+    #: Whether x, y and z go from the middle of the Earth, so that no axis is east, north or up.
+    is_geocentric: bool = False
 
     @property
     def is_identity(self) -> bool:
@@ -118,10 +126,18 @@ def make_local_frame(
     if placement.crs == "enu" and ground.origin_geo is not None:
         geodetic, turn = _geodetic_at(origin, ground.origin_geo)
         rotation, translation = turn @ similarity.rotation, turn @ (similarity.translation - origin)
-        return LocalFrame(similarity.scale, rotation, translation, ExportMetadata(unit=unit, geodetic=geodetic))
+        about = replace(ground, origin_geo=geodetic)
+        named = MapProjection.of(about, "enu")
+        return LocalFrame(
+            similarity.scale, rotation, translation, ExportMetadata(unit=unit, geodetic=geodetic), None, named.name,
+            named.height_reference,
+        )  # fmt: skip
     facts = ExportMetadata((float(origin[0]), float(origin[1]), float(origin[2])), placement.wkt, unit)
     curved = placement if placement.wkt is not None else None
-    return LocalFrame(similarity.scale, similarity.rotation, similarity.translation - origin, facts, curved)
+    return LocalFrame(
+        similarity.scale, similarity.rotation, similarity.translation - origin, facts, curved, placement.name,
+        placement.height_reference, placement.notes, placement.is_geocentric,
+    )  # fmt: skip
 
 
 def _outermost(means: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

@@ -28,6 +28,8 @@ class CrsTransform:
     wkt: str
     height_reference: str
     notes: tuple[str, ...]
+    #: Whether coordinates count from the middle of the Earth.
+    is_geocentric: bool
     #: The factor from metres to the heights of the system: systems without heights get them in their own unit.
     _height_factor: float
     _operation: DatumOperation
@@ -82,6 +84,7 @@ def open_crs(code: str, origin: tuple[float, float, float]) -> CrsTransform:
     return CrsTransform(
         code=code, name=crs.name, unit=unit, meters_per_unit=meters, wkt=crs.to_wkt(),
         height_reference=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
+        is_geocentric=crs.is_geocentric,
         _height_factor=1.0 if own_heights else 1 / meters, _operation=operation,
     )  # fmt: skip
 

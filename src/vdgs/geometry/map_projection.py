@@ -46,6 +46,8 @@ class MapProjection:
     height_reference: str
     #: What a person should know about the accuracy.
     notes: tuple[str, ...]
+    #: Whether coordinates count from the middle of the Earth: no axis is east, north or up.
+    is_geocentric: bool = False
     _forward: Callable[[MapPoints], MapPoints]
     _backward: Callable[[MapPoints], MapPoints]
 
@@ -105,6 +107,24 @@ class MapProjection:
         scale = float(np.sqrt(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1]))))
         return Similarity(scale, rotation, self.project(center[None])[0] - scale * rotation @ center)
 
+    def true_north(self, ground: GroundFrame, center: Float[np.ndarray, "3"]) -> float | None:
+        """Where north is at a point of the ground frame: degrees clockwise from the second axis of the target, between
+        -180 and 180. None where the frame stands at no known place on Earth.
+
+        In the middle of a UTM zone it is 0, and within 4 degrees in all of it; in a polar system any angle.
+        """
+        if ground.origin_geo is None:
+            return None
+        place = geodetic_from_enu(np.asarray(center, np.float64)[None], ground.origin_geo, ground.axes_origin)[0]
+        north = enu_axes(*ground.axes_origin) @ enu_axes(float(place[0]), float(place[1]))[1]
+        x, y, _ = self.similarity_at(center).rotation @ north
+        return float(np.degrees(np.arctan2(x, y)))
+
+    def stretch_at(self, center: Float[np.ndarray, "3"]) -> float:
+        """How many times as long as on the ground lengths are in the target, at a point of the ground frame; 1 where
+        nobody knows its unit."""
+        return 1.0 if self.meters_per_unit is None else self.similarity_at(center).scale * self.meters_per_unit
+
     def _checked(self, found: MapPoints) -> MapPoints:
         if not np.isfinite(found).all():
             raise VdgsError(f"--crs {self.crs}: {self.name} does not reach this place. Give the system of its country.")
@@ -163,6 +183,7 @@ def _projected(ground: GroundFrame, projection: CrsTransform) -> MapProjection:
     def backward(places: MapPoints) -> MapPoints:
         return enu_from_geodetic(projection.to_geodetic(places), origin, level_at)
 
-    shared = {n: getattr(projection, n) for n in ("unit", "meters_per_unit", "wkt", "height_reference", "notes")}
+    names = ("unit", "meters_per_unit", "wkt", "height_reference", "notes", "is_geocentric")
+    shared = {name: getattr(projection, name) for name in names}
     name = f"{projection.name} ({projection.code})"
     return MapProjection(crs=projection.code, name=name, _forward=forward, _backward=backward, **shared)

@@ -65,6 +65,7 @@ img { display: block; max-width: 100%; height: auto; }
 .bar { border-width: 0 2px 3px; overflow-wrap: normal; }
 .north { right: 3%; top: 3%; padding: 2px 7px; text-align: center; }
 .north::before { content: "\\2191"; display: block; font-size: 1.3rem; line-height: 1; }
+.north::before { transform: rotate(var(--north, 0deg)); }
 table.known { width: 100%; font-size: 0.9rem; }
 table.known th { font-weight: 600; width: 9.5rem; white-space: normal; padding-right: 1rem; }
 table.known td { text-align: left; white-space: normal; }
@@ -155,13 +156,15 @@ class Overlay:
     """Of the width of the map."""
 
 
-def map_figure(image: EmbeddedImage, caption: str, alt: str, bar: Overlay | None, north: str | None) -> Html:
-    """A map with a scale bar and an arrow to its upper side, both as text: they stay legible at any width."""
+def map_figure(image: EmbeddedImage, caption: str, alt: str, bar: Overlay | None, north_deg: float | None) -> Html:
+    """A map with a scale bar and an arrow to the north, so many degrees clockwise from its upper side, both as text:
+    they stay legible at any width."""
     parts = [_image_tag(image, alt)]
     if bar is not None:
         parts.append(f'<div class="bar" style="width:{bar.width_percent:.3f}%">{escape_html(bar.text)}</div>')
-    if north is not None:
-        parts.append(f'<div class="north">{escape_html(north)}</div>')
+    if north_deg is not None:
+        turn = f' style="--north:{north_deg:.1f}deg"' if abs(north_deg) >= 0.1 else ""
+        parts.append(f'<div class="north"{turn}>N</div>')
     shown, width = "".join(parts), f"min(100%, {_MAP_HEIGHT_REM * image.width / image.height:.2f}rem)"
     note = f"<figcaption>{escape_html(caption)}</figcaption>"
     return Html(f'<figure><div class="sheet" style="width:{width}">{shown}</div>{note}</figure>')

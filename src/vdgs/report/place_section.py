@@ -63,7 +63,8 @@ def _map_rows(metadata: JsonRecord) -> list[tuple[str, str]]:
     width, height, share = (metadata.number(key) for key in ("width", "height", "mapped_share"))
     if gsd is None or width is None or height is None:
         return []
-    mapped = f"{format_area(share * width * height * gsd**2, unit)} mapped" if share is not None else ""
+    on_ground = gsd / _stretch(metadata)
+    mapped = f"{format_area(share * width * height * on_ground**2, unit)} mapped" if share is not None else ""
     return [("Pixel of the map", ", ".join(part for part in (format_length(gsd, unit), mapped) if part))]
 
 
@@ -71,11 +72,20 @@ def _map_figure(image: EmbeddedImage, metadata: JsonRecord, facts: PlaceFacts | 
     gsd, width, unit = metadata.number("gsd"), metadata.number("width"), metadata.text("unit") or "units"
     bar = None
     if gsd and width and gsd > 0 and width > 0:
-        length = floor_to_nice_length(_BAR_SHARE * gsd * width)
-        bar = Overlay(f"{length:g} {unit}", 100 * length / (gsd * width))
+        across = gsd * width / _stretch(metadata)
+        length = floor_to_nice_length(_BAR_SHARE * across)
+        bar = Overlay(f"{length:g} {unit}", 100 * length / across)
     is_known = facts is not None and facts.latitudes is not None
-    is_north_up = is_known and metadata.text("crs") != "source"
+    north_deg = metadata.number("north_deg")
+    if north_deg is None and is_known and metadata.text("crs") != "source":
+        north_deg = 0.0  # a map of before this was noted
     caption = f"Orthophoto, {metadata.text('crs_name')}{levels_of(metadata)}."
-    if not is_north_up:
+    if north_deg is None:
         caption += " The direction of north is not known."
-    return map_figure(image, caption, "orthophoto of the place", bar, "N" if is_north_up else None)
+    return map_figure(image, caption, "orthophoto of the place", bar, north_deg)
+
+
+def _stretch(metadata: JsonRecord) -> float:
+    """How many times as long as on the ground lengths are on the map."""
+    stretch = metadata.number("stretch")
+    return stretch if stretch and stretch > 0 else 1.0

@@ -19,6 +19,9 @@ HIGHEST_M = 20_000.0
 #: Altitudes in EXIF and XMP that differ by this much (metres) are two, not one that was rounded; those that are farther
 #: apart than the second are not of one reference (choice).
 OTHER_M, MOST_APART_M = 1.0, 30.0
+#: What the references 2 and 3 of EXIF 3.0 say. 0 and 1 are above and below the ellipsoid there, but the sea in EXIF 2,
+#: and most cameras write them of either: they say nothing.
+SEA_LEVEL = "above sea level (GPSAltitudeRef)"
 #: Heights that differ by less (metres) are one number, written twice: near the sea, altitudes are nearly heights.
 SAME_HEIGHT_M = 0.2
 #: EXIF's tags: latitude and longitude, each behind its reference.
@@ -135,37 +138,53 @@ def read_altitudes(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Alti
     reference = reference[0] if isinstance(reference, bytes) and len(reference) == 1 else reference
     value, source = finite(gps.get(6)), ""
     if value is None:
-        value = first_number(xmp, "AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84")
+        value, source = _own_altitude(xmp)
         reference = None
     if value is None and (value := first_number(xmp, "exif:GPSAltitude")) is not None:
         reference, source = text(xmp, "exif:GPSAltitudeRef"), "exif:GPSAltitude in XMP"
-    if value is not None and (str(reference).strip("\x00 ") in ("1", "3") or reference in (1, 3)):
+    mark = str(reference).strip("\x00 ")
+    if value is not None and mark in ("1", "3"):
         value = -abs(value)
+    datum = SEA_LEVEL if mark in ("2", "3") else ""
     absolute = first_number(xmp, "AbsoluteAltitude")
     if value is None or not absolute:
-        return _measured(value, absolute, xmp, source), None
+        return _measured(value, absolute, xmp, source, datum), None
     ellipsoidal = first_number(xmp, "AltitudeWGS84")
     confirmed = bool(ellipsoidal and abs(ellipsoidal - value) < SAME_M)
     by_xmp = not confirmed and _is_absolute_otherwise(value, absolute, xmp)
     own = "AbsoluteAltitude in XMP" if abs(abs(value) - abs(absolute)) >= OTHER_M else ""
-    both = _measured(value, absolute, xmp, ""), _measured(absolute, absolute, xmp, own)
+    both = _measured(value, absolute, xmp, source, datum), _measured(absolute, absolute, xmp, own)
     taken = both[by_xmp] if both[by_xmp][0] is not None else both[not by_xmp]
     return taken, both if abs(value - absolute) >= OTHER_M else None
 
 
-def _measured(value: float | None, absolute: float | None, xmp: Mapping[str, str], source: str) -> Altitude:
-    """An altitude with what it is measured from; `source` where that is not EXIF."""
+def _own_altitude(xmp: Mapping[str, str]) -> tuple[float | None, str]:
+    """The altitude that the maker wrote into XMP alone, and its name."""
+    for name in ("AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84"):
+        if (value := first_number(xmp, name)) is not None:
+            return value, f"{name} in XMP"
+    return None, ""
+
+
+def _measured(
+    value: float | None, absolute: float | None, xmp: Mapping[str, str], source: str, datum: str = ""
+) -> Altitude:
+    """An altitude with what it is measured from; `source` where that is not EXIF, `datum` where its reference says
+    it."""
     if value is None or abs(value) > HIGHEST_M:
         return None, ""
     if value < LOWEST_M:
-        return -value, "EXIF GPSAltitude, whose mark 'below sea level' cannot be true"
+        return -value, f"{source or 'EXIF GPSAltitude'}, whose mark 'below sea level' cannot be true"
     ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, "AltitudeType", "VertCS", "VERTCRS")
     if ellipsoidal is not None and abs(ellipsoidal - value) < SAME_M:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
     if absolute and abs(value - absolute) >= OTHER_M:  # what XMP names is its own
         more = f" by more than {MOST_APART_M:.0f} m" if abs(value - absolute) > MOST_APART_M else ""
         kind = f" ({named})" if named else ""
-        return value, f"EXIF GPSAltitude as recorded, which differs from AbsoluteAltitude in XMP{kind}{more}"
+        of_exif = f"EXIF GPSAltitude{f', {datum}' if datum else ''} as recorded"
+        return value, f"{of_exif}, which differs from AbsoluteAltitude in XMP{kind}{more}"
+    if datum and not named:
+        return value, f"{source or 'EXIF GPSAltitude'}, {datum} as recorded"
     if named and source:
         named = f"{source} ({named})"
     return value, f"{named} as recorded" if named else f"{source or 'EXIF GPSAltitude'} as recorded, datum not stated"

@@ -121,6 +121,10 @@ class ExportedFile(TypedDict):
     gaussians: int
     bytes: int
     seconds: float
+    #: The system of its coordinates, for people, and what the third counts from.
+    crs_name: str
+    heights: str
+    #: What is to be known of that system, and what was lost.
     notes: list[str]
 
 
@@ -149,6 +153,10 @@ class MapMetadata(TypedDict, total=False):
     unit: str
     heights: str
     georeference: str
+    #: Where north is in the middle of the map, in degrees clockwise from its top; None where nobody knows.
+    north_deg: float | None
+    #: How many times as long as on the ground lengths are on the map, there.
+    stretch: float
     gsd: float
     width: int
     height: int

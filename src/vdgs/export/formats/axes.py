@@ -46,6 +46,10 @@ Y_UP = Axes("y-up", "x east, y up, z south", np.array([[1.0, 0, 0], [0, 0, 1], [
 Y_DOWN = Axes("y-down", "x west, y down, z south", np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]]))
 #: Left-handed: Unity's.
 Y_UP_LEFT = Axes("y-up-left", "x east, y up, z north", np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
+#: Of points in Earth-centered coordinates, which no program stands upright.
+EARTH_CENTERED = Axes(
+    "earth-centered", "x to latitude 0 longitude 0, y to latitude 0 longitude 90 east, z to the north pole", np.eye(3)
+)
 ALL = (Z_UP, Y_UP, Y_DOWN, Y_UP_LEFT)
 BY_NAME = {axes.name: axes for axes in ALL}
 

@@ -114,23 +114,44 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
                                                 opacities(piece), header))  # fmt: skip
 
     write_atomic(path, write)
+    of_system: tuple[str, ...] = ()
     if scene.metadata.crs:
         metadata_path(path).unlink(missing_ok=True)
+        of_system = _las_wkt(_crs(path, scene.metadata.crs))[1]
     else:
         write_metadata_file(path, scene.metadata, Z_UP)
-    return (*LOSS_NOTES, f"coordinates are rounded to {scale:g} {scene.metadata.unit}")
+    return (*of_system, *LOSS_NOTES, f"coordinates are rounded to {scale:g} {scene.metadata.unit}")
 
 
 def _las_header(path: Path, metadata: ExportMetadata, scale: float) -> laspy.LasHeader:
     import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
 
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales = np.full(3, scale)
     header.offsets = np.array(metadata.origin)
     header.generating_software = metadata.program[:32]
     if metadata.crs:
-        header.add_crs(_crs(path, metadata.crs))
+        header.vlrs.append(WktCoordinateSystemVlr(_las_wkt(_crs(path, metadata.crs))[0]))
+        header.global_encoding.wkt = True
     return header
+
+
+def _las_wkt(crs: Any) -> tuple[str, tuple[str, ...]]:
+    """A system as record 2112 of LAS 1.4 holds it, WKT 1 (OGC 01-009), and what is lost: WKT 2 where that has no words
+    for the system.
+
+    GDAL's WKT 1 names no axes for systems to the north and east: x is east then, as in the points.
+    """
+    import pyproj
+
+    try:
+        return crs.to_wkt("WKT1_GDAL"), ()
+    except pyproj.exceptions.CRSError:
+        return crs.to_wkt(), (
+            f"{crs.name} stands in the file as WKT 2, for WKT 1 cannot say it: programs that read only what LAS 1.4 "
+            "asks for find no coordinate system",
+        )
 
 
 def _las_points(

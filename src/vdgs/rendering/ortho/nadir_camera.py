@@ -100,6 +100,11 @@ class NadirCamera:
             height=grid.height, model="orthographic",
         )  # fmt: skip
 
+    def middle_of(self, grid: PixelGrid) -> Float[np.ndarray, "3"]:
+        """What lies on the ground in the middle of a map, in the ground frame."""
+        middle: np.ndarray = self.placement.to_ground(np.array([[*grid.center, self._ground_level]]))[0]
+        return middle
+
     @cached_property
     def _ground_level(self) -> float:
         """Height of the ground in the target's coordinates."""
@@ -107,8 +112,7 @@ class NadirCamera:
 
     def _similarity(self, grid: PixelGrid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""
-        level = self._ground_level
-        center = self.placement.to_ground(np.array([[*grid.center, level]]))[0]
+        level, center = self._ground_level, self.middle_of(grid)
         similarity = self.placement.similarity_at(center)
         x0, y0, x1, y1 = grid.bounds
         corners = np.array([[x, y, level] for x in (x0, x1) for y in (y0, y1)])

@@ -24,7 +24,8 @@ from vdgs.system.figure_style import INK, MUTED, VISIBILITY_CMAP, draw_titles, n
 from vdgs.system.units import floor_to_nice_length
 from vdgs.visibility.visibility_map import visibility_color_norm
 
-#: The sun of a hillshade: from the north-west, half way up, as on printed maps.
+#: The sun of a hillshade: from the upper left of the sheet, half way up, as on printed maps. That is so wherever north
+#: is: lit from below, hills are taken for hollows.
 AZIMUTH_DEG, ALTITUDE_DEG = 315.0, 45.0
 #: Longest side of pictures, in pixels.
 MAX_IMAGE_PX = 2400
@@ -45,7 +46,7 @@ class PreviewSheet:
 def hillshade(heights: Float[np.ndarray, "h w"], pixel_size: float) -> Float[np.ndarray, "h w"]:
     """Light on a surface (NaN where there is none), 0 to 1, for pixels of so many units; level ground has 0.71."""
     down, right = np.gradient(heights, pixel_size) if min(heights.shape) > 1 else (np.zeros_like(heights),) * 2
-    # The normal is (-right, down, 1): rows run south, north is up.
+    # The normal is (-right, down, 1): rows run downwards; the azimuth counts from the top of the sheet.
     azimuth, altitude = np.radians(AZIMUTH_DEG), np.radians(ALTITUDE_DEG)
     sun = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
     lit = (sun[2] - sun[0] * right + sun[1] * down) / np.sqrt(1 + right * right + down * down)
@@ -100,9 +101,9 @@ def write_preview(orthophoto: Path, dsm: Path, visibility: Path, file: Path, she
         axes.set_yticklabels([])
     east, north = ("easting", "northing") if sheet.placement.crs.startswith(("EPSG", "enu")) else ("x", "y")
     panels[0].set(xlabel=f"{east} ({sheet.placement.unit})", ylabel=f"{north} ({sheet.placement.unit})")
-    _scale_bar(panels[0], grid, sheet.placement)
-    _north(panels[0], "N" if east == "easting" else "y")
     metadata = sheet.metadata
+    _scale_bar(panels[0], grid, sheet.placement, metadata["stretch"])
+    _north(panels[0], grid, metadata["north_deg"])
     draw_titles(
         figure, sheet.name,
         f"{sheet.placement.name}; {grid.width} x {grid.height} pixels of {grid.gsd:g} {sheet.placement.unit}; "
@@ -153,24 +154,32 @@ def _legend(figure: Figure, axes: Axes, colors: ScalarMappable, label: str) -> N
     bar.set_title(label, fontsize=7, color=INK, loc="left", pad=4)
 
 
-def _scale_bar(axes: Axes, grid: PixelGrid, placement: MapProjection) -> None:
-    """A round length of about a quarter of the map, on white."""
+def _scale_bar(axes: Axes, grid: PixelGrid, placement: MapProjection, stretch: float) -> None:
+    """A round length on the ground of about a quarter of the map, on white; on the map it is `stretch` times as
+    long."""
     x0, y0, x1, y1 = grid.bounds
-    length = floor_to_nice_length((x1 - x0) / 4)
+    length = floor_to_nice_length((x1 - x0) / stretch / 4)
+    drawn = length * stretch
     left, low, thick = x0 + 0.05 * (x1 - x0), y0 + 0.05 * (y1 - y0), 0.012 * (y1 - y0)
     for k, color in enumerate((INK, "white")):
-        corner = (left + k * length / 2, low)
-        axes.add_patch(matplotlib.patches.Rectangle(corner, length / 2, thick, fc=color, ec=INK, lw=0.8))
+        corner = (left + k * drawn / 2, low)
+        axes.add_patch(matplotlib.patches.Rectangle(corner, drawn / 2, thick, fc=color, ec=INK, lw=0.8))
     axes.text(
-        left + length / 2, low + 1.6 * thick, f"{length:g} {placement.unit}", ha="center", va="bottom", fontsize=8,
+        left + drawn / 2, low + 1.6 * thick, f"{length:g} {placement.unit}", ha="center", va="bottom", fontsize=8,
         color=INK, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
     )  # fmt: skip
 
 
-def _north(axes: Axes, name: str) -> None:
-    """An arrow to the top, which is grid north where there is one."""
+def _north(axes: Axes, grid: PixelGrid, north_deg: float | None) -> None:
+    """An arrow to the north, which is not the top of every map; along y where nobody knows the north."""
+    x0, y0, x1, y1 = grid.bounds
+    across, along = x1 - x0, y1 - y0
+    angle, half = np.radians(north_deg or 0.0), min(0.055 * along, 0.2 * across)
+    ahead = half * np.array([np.sin(angle), np.cos(angle)])
+    middle = np.array([x1 - 0.06 * across - abs(ahead[0]), y1 - 0.03 * along - half])
     axes.annotate(
-        name, xy=(0.94, 0.97), xytext=(0.94, 0.86), xycoords="axes fraction", ha="center", va="center", fontsize=9,
-        fontweight="bold", color=INK, arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.2},
+        "y" if north_deg is None else "N", xy=tuple(middle + ahead), xytext=tuple(middle - ahead), ha="center",
+        va="center", fontsize=9, fontweight="bold", color=INK,
+        arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.2},
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
     )  # fmt: skip

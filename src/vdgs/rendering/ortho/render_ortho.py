@@ -212,10 +212,12 @@ def _bands(tile: OrthoTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _metadata(plan: OrthoPlan) -> MapMetadata:
     grid, placement, capture = plan.grid, plan.placement, plan.nadir_camera.capture
+    middle = plan.nadir_camera.middle_of(grid)
     return {
         "software": ortho_plan.software_name(), "model": plan.model, "model_digest": plan.model_digest,
         "crs": placement.crs, "crs_name": placement.name, "unit": placement.unit,
         "heights": placement.height_reference, "georeference": capture.ground.description,
+        "north_deg": placement.true_north(capture.ground, middle), "stretch": placement.stretch_at(middle),
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
         "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
         "training_cameras": len(capture.train_views),
