@@ -53,6 +53,7 @@ def run_of(folder: Path, place: PlaceFacts, blocks: int = 1, maps: bool = True) 
         metadata = {
             "model_digest": "1-a", "crs": "EPSG:32711" if place.unit == "m" else "local", "crs_name": "the map's own",
             "unit": place.unit, "gsd": 0.1, "width": 90, "height": 60, "mapped_share": 0.5,
+            "north_deg": 0.0 if place.unit == "m" else None, "stretch": 1.0,
         }  # fmt: skip
         (folder / "maps/map.json").write_text(json.dumps(metadata))
         Image.new("RGB", (90, 60), "teal").save(folder / "maps/orthophoto.png")

@@ -54,7 +54,7 @@ def place_panel(report: ReportedRun, source: RunFiles, facts: PlaceFacts | None)
     if image is None:
         picture = paragraph("There is no orthophoto of this model yet: `vdgs ortho RUN` draws it.", "facts")
     else:
-        picture = _map_figure(image, metadata, facts)
+        picture = _map_figure(image, metadata)
     return side_by_side(picture, facts_table(rows))
 
 
@@ -68,17 +68,14 @@ def _map_rows(metadata: JsonRecord) -> list[tuple[str, str]]:
     return [("Pixel of the map", ", ".join(part for part in (format_length(gsd, unit), mapped) if part))]
 
 
-def _map_figure(image: EmbeddedImage, metadata: JsonRecord, facts: PlaceFacts | None) -> Html:
+def _map_figure(image: EmbeddedImage, metadata: JsonRecord) -> Html:
     gsd, width, unit = metadata.number("gsd"), metadata.number("width"), metadata.text("unit") or "units"
     bar = None
     if gsd and width and gsd > 0 and width > 0:
         across = gsd * width / _stretch(metadata)
         length = floor_to_nice_length(_BAR_SHARE * across)
         bar = Overlay(f"{length:g} {unit}", 100 * length / across)
-    is_known = facts is not None and facts.latitudes is not None
     north_deg = metadata.number("north_deg")
-    if north_deg is None and is_known and metadata.text("crs") != "source":
-        north_deg = 0.0  # a map of before this was noted
     caption = f"Orthophoto, {metadata.text('crs_name')}{levels_of(metadata)}."
     if north_deg is None:
         caption += " The direction of north is not known."
