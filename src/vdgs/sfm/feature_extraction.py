@@ -69,8 +69,8 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     """Photographs by the cameras that they share, in the order of their first names; their numbers are 1, 2, ..."""
     groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
-        focal = photo.lens.focal if photo.lens else None
-        key = (photo.camera, photo.size, focal and round(focal, 4), photo.camera_model, photo.face or photo.sensor)
+        lens = round(photo.lens.focal, 4) if photo.lens else f"{photo.focal_mm or 0:.2f} mm"
+        key = (photo.camera, photo.size, lens, photo.camera_model, photo.face or photo.sensor)
         groups.setdefault(key, []).append(photo)
     kinds = []
     for members in groups.values():
