@@ -13,11 +13,13 @@ from support.flights import write_photograph
 from support.small_flights import COUNT, flight, picture, pixels
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.cross_checks import cross_checked
+from vdgs.sfm.feature_extraction import CameraGroup, group_by_camera
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.incremental_mapper import ASKED, fit_doubted, should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
+from vdgs.system.lazy_pycolmap import pycolmap
 
 WHOLE = (160, 120)
 
@@ -34,7 +36,7 @@ def seen_with(folder: Path, size: tuple[int, int], count: int = 2) -> tuple[list
 @pytest.mark.parametrize(
     ("size", "how"), [((100, 100), "cut only"), ((90, 110), "cut only"), ((64, 64), "shrunk"), ((128, 72), "cut only")]
 )
-def test_another_shape_that_is_smaller_on_both_sides_is_doubted_fitted_and_named(tmp_path, size, how):
+def test_another_shape_that_is_smaller_on_both_sides_is_doubted_and_named(tmp_path, size, how):
     whole, cut = seen_with(tmp_path, size)
     pixels_of = {photo.lens.focal * max(photo.size) for photo in cut}
     expected = whole[0].lens.focal * (max(WHOLE) if how == "cut only" else max(size))
@@ -42,7 +44,8 @@ def test_another_shape_that_is_smaller_on_both_sides_is_doubted_fitted_and_named
     assert all(f"as if it was {how}" in photo.doubts[-1] and photo.lens.doubt for photo in cut)
     assert not any(photo.doubts for photo in whole)
     positions = read_gps_priors([*cut, *whole], None, (1.0, 2.0))
-    assert should_fix_focal([*cut, *whole], positions, SfmOptions())[0] is False
+    assert should_fix_focal([*cut, *whole], positions, SfmOptions())[0]
+    assert [group.is_doubted for group in group_by_camera([*cut, *whole])] == [True, False]
     listed = replace(collect_images([tmp_path]), images=(*cut, *whole))
     warnings = make_preflight_report(listed, positions).warnings
     assert any("DJI_0001.JPG, DJI_0002.JPG: of another shape than most of its camera" in each for each in warnings)
@@ -59,6 +62,28 @@ def test_the_same_shape_is_taken_as_shrunk_and_that_is_said(tmp_path):
     whole, small = seen_with(tmp_path, (120, 90))
     assert {photo.lens for photo in small} == {whole[0].lens}
     assert all("as if it was shrunk, not cut" in photo.doubts[-1] for photo in small)
+
+
+@pytest.mark.parametrize("why", ["one height", ASKED])
+def test_a_doubted_focal_length_alone_is_fitted_where_those_of_the_others_are_held(why):
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 1, 6, 150
+    model = pycolmap.synthesize_dataset(options)
+    true = [model.cameras[k].focal_length for k in (1, 2)]
+    model.cameras[2].focal_length *= 1.2
+    as_held = pycolmap.BundleAdjustmentOptions()
+    as_held.print_summary, as_held.refine_focal_length = False, False
+    pycolmap.bundle_adjustment(model, as_held)  # what a mapper makes of it
+    groups = [
+        CameraGroup(
+            camera="", width=0, height=0, focal_px=true[0], has_focal_prior=True, source="", images=(),
+            is_doubted=doubted,
+        )
+        for doubted in (False, True)
+    ]  # fmt: skip
+    fit_doubted(model, (True, why), groups, 1)
+    assert model.cameras[1].focal_length == true[0]
+    assert (model.cameras[2].focal_length == pytest.approx(true[1], rel=0.01)) is (why != ASKED)
 
 
 def cut_copy(folder: Path, name: str, file: Path, box: tuple[int, int, int, int], moment: str = "") -> None:
