@@ -149,7 +149,7 @@ def _smaller_on_both_sides(photo: ImageMetadata, lens: Lens, usual: tuple[int, i
         f"was {'cut only' if cut else 'shrunk'}. Give it as the camera took it, or leave it out"
     )
     focal = usual_lens.focal * usual_longer / longer if cut else lens.focal
-    lens = replace(lens, focal=focal, doubt=doubt, confirmed=False)
+    lens = replace(lens, focal=focal, doubt=doubt)
     return replace(photo, lens=lens, doubts=(*photo.doubts, doubt))
 
 

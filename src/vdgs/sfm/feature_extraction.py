@@ -71,22 +71,22 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     """Photographs by the cameras that they share, in the order of their first names; their numbers are 1, 2, ..."""
     groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
-        lens = round(photo.lens.focal, 4) if photo.lens else f"{photo.focal_mm or 0:.2f} mm"
-        key = (photo.camera, photo.size, lens, photo.camera_model, photo.face or photo.sensor)
+        focal = round(photo.lens.focal, 4) if photo.lens else f"{photo.focal_mm or 0:.2f} mm"
+        key = (photo.camera, photo.size, focal, photo.camera_model, photo.face or photo.sensor)
         groups.setdefault(key, []).append(photo)
     kinds = []
     for members in groups.values():
         first = members[0]
         lens, longer = first.lens, max(first.width, first.height)
         guess = FISHEYE_FOCAL_FACTOR if first.camera_model == FISHEYE else DEFAULT_FOCAL_FACTOR
-        focal = (lens.focal if lens else guess) * longer
+        focal_px = (lens.focal if lens else guess) * longer
         source = lens.source if lens else "a guess"
         kinds.append(
             CameraGroup(
                 camera=f"{first.camera}, {first.sensor.rstrip('/')}" if first.sensor else first.camera,
                 width=first.width,
                 height=first.height,
-                focal_px=focal,
+                focal_px=focal_px,
                 has_focal_prior=bool(lens),
                 source=source,
                 images=tuple(members),

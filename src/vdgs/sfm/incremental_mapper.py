@@ -140,7 +140,8 @@ def is_contradicted(
 ) -> bool:
     """Whether the focal length of a model was held at what one tag alone says, and the photographs plainly say another:
     programs that shrink photographs rewrite what tags count from."""
-    said = {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
+    alone = [group.has_focal_prior and not (group.is_confirmed or group.is_doubted) for group in groups]
+    said = {k: group.focal_px for k, (group, one) in enumerate(zip(groups, alone, strict=True), 1) if one}
     if not held[0] or held[1] == ASKED or not said:
         return False
     fitted = pycolmap.Reconstruction(model)

@@ -357,11 +357,11 @@ def _mapped(
     if not workspace.is_begun("model", anew):
         models = _models(plan, workspace, key, count, held[0], console)
         held = incremental_mapper.release_focal(models, held, plan.threads)
-        known = workspace.is_done("focal", key)
-        if known or not incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
-            if not known:
-                workspace.finish("focal", key)
-            incremental_mapper.fit_doubted(models[0], held, kinds, plan.threads)
+        incremental_mapper.fit_doubted(models[0], held, kinds, plan.threads)
+        if workspace.is_done("focal", key):
+            return models, held
+        if not incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
+            workspace.finish("focal", key)
             return models, held
         console.print(
             "[yellow]note[/] the photographs contradict the focal length that is held; it is fitted, all anew",
