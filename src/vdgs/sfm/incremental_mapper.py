@@ -159,8 +159,10 @@ def fit_doubted(
 ) -> None:
     """Fit the lenses of a model whose focal lengths are doubted, where those of the others are held: the others tell
     the shape of the ground, and that tells these."""
+    if not held[0] or held[1] == ASKED:
+        return
     sure = {number for number in model.cameras if not groups[number - 1].is_doubted}
-    if not held[0] or held[1] == ASKED or len(sure) in (0, len(model.cameras)):
+    if len(sure) in (0, len(model.cameras)):
         return
     config = pycolmap.BundleAdjustmentConfig()
     for image in placed_images(model):
