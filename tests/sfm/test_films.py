@@ -344,6 +344,12 @@ def test_films_beside_photographs_are_named_and_used_where_they_are_named(
     assert films_in([tmp_path / "mixed"]) == []
     assert any("1 film beside the photographs: not used" in note for note in collect_images([tmp_path / "mixed"]).notes)
     assert films_in([tmp_path / "mixed", film]) == [film]
+    both, _ = take(ask(tmp_path / "out", tmp_path / "mixed", film, num_frames=8))
+    assert not any("not used" in note for note in both.notes)
+    for photo in collect_images([tmp_path / "mixed"]).images[1:]:
+        photo.path.unlink()
+    with pytest.raises(CaptureError, match=rf"(?s)1 photograph that can.*1 film .*not used \({film.name}\).*name it"):
+        collect_images([tmp_path / "mixed"])
 
 
 def test_the_same_command_takes_no_frame_twice_and_other_films_are_refused(

@@ -12,7 +12,7 @@ from PIL import Image
 from vdgs.captures.image_files import open_image
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
-from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
+from vdgs.sfm.focal_length import CUT, EQUIVALENT, MAX_SHRUNK, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import BODY, GIMBAL, ImageMetadata, looks_backwards
 from vdgs.sfm.other_cameras import other_cameras
 from vdgs.sfm.photograph_versions import versions
@@ -109,8 +109,9 @@ def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
 
 
 def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
-    """Photographs that share one side with most of their camera and lack some of the longer one were cut by a program,
-    which leaves the focal length in pixels as it was."""
+    """Photographs that share the shorter side with most of their camera and lack some of the longer one were cut by a
+    program, which leaves the focal length in pixels as it was. What those of another shape lack on both sides was cut,
+    and perhaps shrunk: their focal length is doubted."""
     known = [photo for photo in group if photo.lens is not None]
     if not known:
         return group
@@ -123,8 +124,34 @@ def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
             doubt = "cut to another shape than most of its camera; the focal length in pixels is taken as theirs"
             focal = usual_lens.focal * max(size) / longer
             photo = replace(photo, lens=replace(lens, focal=focal), doubts=(*photo.doubts, doubt))
+        elif lens and usual_lens and lens.focal_mm == usual_lens.focal_mm and not (lens.doubt or lens.remark):
+            photo = _smaller_on_both_sides(photo, lens, size, usual_lens)
         found.append(photo)
     return found
+
+
+def _smaller_on_both_sides(photo: ImageMetadata, lens: Lens, usual: tuple[int, int], usual_lens: Lens) -> ImageMetadata:
+    """The photograph, with a doubt of its lens if it has another shape than the `usual` size of its camera, is shorter
+    on both sides, and no mode of the camera: those have its whole width or height, at half the pixels perhaps. One of
+    the same shape is taken as shrunk, and that is said."""
+    (short, longer), (usual_short, usual_longer) = sorted(photo.size), sorted(usual)
+    shares = short / usual_short, longer / usual_longer
+    whole = max(shares)  # how much it was shrunk if nothing but its shape was cut
+    side, usual_side = (short, usual_short) if shares[0] == whole else (longer, usual_longer)
+    if whole >= 1 or usual_side % side == 0:
+        return photo
+    if 1 - min(shares) / whole < CUT:
+        said = "smaller than most of its camera; its focal length is taken as if it was shrunk, not cut"
+        return replace(photo, doubts=(*photo.doubts, said)) if _near(lens.focal, usual_lens.focal) else photo
+    cut = whole > MAX_SHRUNK
+    doubt = (
+        f"of another shape than most of its camera, and shorter on both sides ({photo.width} x {photo.height} px, "
+        f"others {usual[0]} x {usual[1]}): it was cut, and perhaps shrunk; the focal length is a guess, as if it "
+        f"was {'cut only' if cut else 'shrunk'}. Give it as the camera took it, or leave it out"
+    )
+    focal = usual_lens.focal * usual_longer / longer if cut else lens.focal
+    lens = replace(lens, focal=focal, doubt=doubt)
+    return replace(photo, lens=lens, doubts=(*photo.doubts, doubt))
 
 
 def _near(one: float, other: float) -> bool:
@@ -193,9 +220,9 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     tagged = [photo for photo in photographs if not photo.is_bare]
     bare = [photo for photo in photographs if photo.is_bare and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()
-    kinds = Counter((photo.size, photo.camera, photo.lens) for photo in tagged)
+    kinds = Counter((photo.size, photo.camera, photo.lens, photo.focal_mm) for photo in tagged)
     for photo in bare:
-        alike = [(camera, lens) for size, camera, lens in kinds if size == photo.size]
+        alike = [(camera, lens, mm) for size, camera, lens, mm in kinds if size == photo.size]
         if len(bare) > len(tagged):
             if len(alike) == 1 and alike[0][1] is not None:
                 lent[photo.name] = replace(photo, doubts=(*photo.doubts, _may_be_by(alike[0][0])))
@@ -207,9 +234,11 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
         elif alike and is_black_and_white(photo):
             reasons[photo.name] = "is black and white and has no tags of a camera: a mask? Name it like its photograph"
         elif len(alike) == 1:
-            camera, lens = alike[0]
+            camera, lens, focal_mm = alike[0]
             doubt = f"no tags of a camera; taken as by {camera}, as the others of its size"
-            lent[photo.name] = replace(photo, camera=camera, lens=lens, doubts=(*photo.doubts, doubt))
+            lent[photo.name] = replace(
+                photo, camera=camera, lens=lens, focal_mm=focal_mm, doubts=(*photo.doubts, doubt)
+            )
     return reasons, lent
 
 

@@ -15,8 +15,13 @@ EDITED_WORDS = "|".join(
     )
 )  # fmt: skip
 _COPY_NAME = re.compile(
-    r"(?P<first>.+?)(?:[ _-]+(?:copy|copie|kopie|copia)(?:[ _]?\(?\d{1,2}\)?)?"
-    rf"|[-_~](?:{EDITED_WORDS}|edit|hdr|enhanced(?:-(?:nr|sr|rd)){{0,3}})(?P<double>\(\d{{1,2}}\))?)",
+    r"(?P<first>.+?)(?:[ _-]+(?:copy|copie|kopie|copia|cópia|kopia|kopi|копия)(?:[ _]?\(?\d{1,2}\)?)?"
+    rf"|[-_~](?:{EDITED_WORDS}|edit|crop|cropped|hdr|enhanced(?:-(?:nr|sr|rd)){{0,3}})(?P<double>\(\d{{1,2}}\))?)",
+    re.IGNORECASE,
+)
+#: What Google Drive and systems put in front of the name of a copy: "Copy of DJI_0002.JPG".
+_COPY_OF = re.compile(
+    r"(?:copy[ _]of|kopie[ _]v[ao]n|copie[ _]de|c[oó]pia[ _]d[eio]|kopia|kopi[ _]a[vf]|копия)[ _]+(?P<first>.+)",
     re.IGNORECASE,
 )
 #: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
@@ -29,6 +34,8 @@ def first_stems(stem: str) -> list[str]:
     stem = unicodedata.normalize("NFC", stem)
     if match := _EDITED_ON_PHONE.fullmatch(stem):
         return ["".join(match.groups()).lower()]
+    if match := _COPY_OF.fullmatch(stem):
+        return [match["first"].lower()]
     if match := _COPY_NAME.fullmatch(stem):
         return list(dict.fromkeys((f"{match['first']}{match['double'] or ''}".lower(), match["first"].lower())))
     return []

@@ -63,33 +63,36 @@ class CameraGroup:
     """COLMAP's model of the lens."""
     is_confirmed: bool = True
     """False where one tag alone says the focal length."""
+    is_doubted: bool = False
+    """Whether nothing says the focal length, or what says it is doubted."""
 
 
 def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     """Photographs by the cameras that they share, in the order of their first names; their numbers are 1, 2, ..."""
     groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
-        focal = photo.lens.focal if photo.lens else None
-        key = (photo.camera, photo.size, focal and round(focal, 4), photo.camera_model, photo.face or photo.sensor)
+        focal = round(photo.lens.focal, 4) if photo.lens else f"{photo.focal_mm or 0:.2f} mm"
+        key = (photo.camera, photo.size, focal, photo.camera_model, photo.face or photo.sensor)
         groups.setdefault(key, []).append(photo)
     kinds = []
     for members in groups.values():
         first = members[0]
         lens, longer = first.lens, max(first.width, first.height)
         guess = FISHEYE_FOCAL_FACTOR if first.camera_model == FISHEYE else DEFAULT_FOCAL_FACTOR
-        focal = (lens.focal if lens else guess) * longer
+        focal_px = (lens.focal if lens else guess) * longer
         source = lens.source if lens else "a guess"
         kinds.append(
             CameraGroup(
                 camera=f"{first.camera}, {first.sensor.rstrip('/')}" if first.sensor else first.camera,
                 width=first.width,
                 height=first.height,
-                focal_px=focal,
+                focal_px=focal_px,
                 has_focal_prior=bool(lens),
                 source=source,
                 images=tuple(members),
                 model=first.camera_model,
                 is_confirmed=lens is None or lens.confirmed,
+                is_doubted=not first.face and (lens is None or bool(lens.doubt)),
             )
         )
     return kinds

@@ -20,8 +20,10 @@ from vdgs.captures.image_suffixes import (
 )
 from vdgs.captures.name_resolution import to_colmap_name, to_nfc
 from vdgs.captures.optional_decoders import INSTALL
+from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER
 from vdgs.captures.strays import MASKED, is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
+from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.quoting import check_is_text
 from vdgs.system.units import first_names
 
@@ -46,6 +48,8 @@ class Found:
     """Photographs of kinds that are not read, by their suffix."""
     doubled: Counter[str] = field(default_factory=Counter)
     """HEIC and raw files beside a picture of the same name, by their suffix."""
+    films: list[str] = field(default_factory=list)
+    """Names of films that are not used."""
     archives: list[str] = field(default_factory=list)
     """Names of files in which photographs may be packed."""
     dangling: list[Path] = field(default_factory=list)
@@ -56,11 +60,7 @@ class Found:
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
         kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]
-        films = sum(self.unread.values()) - sum(self.unread[kind] for kind in kinds)
-        notes = [
-            f"{films} film{'s' if films > 1 else ''} beside the photographs: not used. To use a film too, name it."
-        ]
-        notes = notes if films else []
+        notes = [f"{said}."] if (said := self.films_beside()) else []
         notes += [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
         notes += [
             f"{_count(number, kind)} not used, but the pictures of the same names beside. To use the others, give a "
@@ -76,6 +76,13 @@ class Found:
             shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
             notes.append(f"not read: {shown} ({why}).")
         return notes
+
+    def films_beside(self) -> str:
+        """What to tell of films that are not used; empty where there are none."""
+        if not self.films:
+            return ""
+        count = f"{len(self.films)} film{'s' if len(self.films) > 1 else ''}"
+        return f"{count} beside the photographs: not used ({first_names(self.films)}). To use a film too, name it"
 
     def dangling_links(self) -> str:
         """What to tell of links to what is not there; empty where there are none."""
@@ -130,7 +137,7 @@ def _films_alone(folder: Path) -> list[Path]:
 
 def find_files(folders: Sequence[Path]) -> Found:
     """The photographs in the folders and those below them. Raises CaptureError for two of one name."""
-    found, seen = Found(), set[Path]()
+    found, seen, used = Found(), set[Path](), _films_of_frames(folders)
     for folder, prefix in zip(folders, _prefixes(folders), strict=True):
         for _, files, skipped in walk(folder):
             found.skipped |= {prefix + path.relative_to(folder).as_posix(): why for path, why in skipped.items()}
@@ -142,9 +149,21 @@ def find_files(folders: Sequence[Path]) -> Found:
                     if real not in seen:  # a folder and one inside it may both be named
                         seen.add(real)
                         _add(found, path, prefix + path.relative_to(folder).as_posix(), stems)
-                else:
+                elif not (is_film(path) and str(path.resolve()) in used):
                     _count_other(found, path, stems)
     found.named = dict(sorted(found.named.items()))
+    return found
+
+
+def _films_of_frames(folders: Sequence[Path]) -> set[str]:
+    """The films whose frames lie in one of the folders."""
+    found = set[str]()
+    for folder in folders:
+        if folder.name == FRAMES_FOLDER:
+            try:
+                found |= {record["film"] for record in read_json_or_empty(folder.parent / FILMS_FILE).values()}
+            except (ValueError, TypeError, KeyError):
+                continue  # of another program
     return found
 
 
@@ -183,6 +202,8 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
         found.archives.append(path.name)
     if suffix in OTHER_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
+        if suffix in VIDEO_SUFFIXES:
+            found.films.append(path.name)
     elif suffix in HEIF_SUFFIXES | RAW_SUFFIXES:
         found.doubled[suffix] += 1
 

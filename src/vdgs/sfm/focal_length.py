@@ -231,6 +231,11 @@ def _zoom(details: Mapping[int, Any]) -> float:
     return zoom if 1 <= zoom <= LARGEST_ZOOM else 1.0
 
 
+def zoomed_focal_mm(details: Mapping[int, Any]) -> float | None:
+    """EXIF's FocalLength in millimetres, times its DigitalZoomRatio."""
+    return _times(_number(details.get(0x920A)), _zoom(details))
+
+
 def _zoomed_equivalent(equivalent: float | None, others: Sequence[float | None], zoom: float) -> float | None:
     """Most cameras count the digital zoom in their 35 mm equivalent; where the others say that this one does not, it is
     multiplied."""

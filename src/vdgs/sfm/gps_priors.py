@@ -185,9 +185,12 @@ def _in_space_or_plane(
     geodetic = without_zero_altitudes(geodetic, known)
     kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
     if not has_altitudes:
+        without = known & ~np.isfinite(geodetic[:, 2])
+        others = int((known & ~without).sum())
+        said = f"; those of {others} more are not used" if others else ""
         notes.append(
-            f"{_some(names, known)}: the positions have no altitudes. Positions give scale and north, views or "
-            "attitudes give up; heights above the sea are not known."
+            f"{_some(names, without)}: the positions have no altitudes{said}. Positions give scale "
+            "and north, views or attitudes give up; heights above the sea are not known."
         )
         return np.where([True, True, False], geodetic, 0.0), kept, False
     if (kept != known).any():

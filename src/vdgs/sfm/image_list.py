@@ -113,8 +113,8 @@ def collect_images(
     ]
     notes += [f"not read: {poses}. Poses are made anew." for folder in folders for poses in foreign_poses(folder)]
     if len(chosen.photographs) < MIN_IMAGES:
-        dangling = found.dangling_links()
-        raise _too_few(folders, len(chosen.photographs), [each.line for each in left_out] + [dangling] * bool(dangling))
+        unused = filter(None, (found.films_beside(), found.dangling_links()))
+        raise _too_few(folders, len(chosen.photographs), [*unused, *(each.line for each in left_out)])
     return ImageList(tuple(folders), tuple(chosen.photographs), tuple(left_out), found.others, tuple(notes))
 
 

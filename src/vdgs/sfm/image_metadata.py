@@ -28,7 +28,7 @@ from vdgs.sfm.exif_gps import (
     read_fix,
     read_place,
 )
-from vdgs.sfm.focal_length import Lens, read_lens
+from vdgs.sfm.focal_length import Lens, read_lens, zoomed_focal_mm
 from vdgs.sfm.map_datums import to_wgs84
 from vdgs.sfm.spectral_bands import band_of, is_surely_of_band
 from vdgs.sfm.thermal_signs import thermal_sign
@@ -183,6 +183,8 @@ class ImageMetadata:
     camera: str
     """Maker, model and serial number, as far as known."""
     lens: Lens | None
+    focal_mm: float | None = None
+    """EXIF's FocalLength in millimetres, times its digital zoom; with an unknown sensor it tells lenses apart alone."""
     datetime: str
     """Date and time as EXIF has them, 2026:06:23 16:31:59; empty where it says none."""
     lat_lon: tuple[float, float] | None
@@ -331,6 +333,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         orientation=orientation,
         camera=_camera(tags, details, xmp),
         lens=lens,
+        focal_mm=zoomed_focal_mm(details),
         datetime=plain_text(details.get(0x9003)) or plain_text(tags.get(0x0132)),
         subsecond=_subsecond(details),
         lat_lon=place,

@@ -29,6 +29,8 @@ _THERMAL_WORD = re.compile(
 _THERMAL_TAIL = re.compile(r".*_[RT](?:_.*)?", re.IGNORECASE)
 #: A name with the letter of a camera.
 _LETTERED = re.compile(r"(?P<number>.*)_(?P<letter>[A-Z])(?P<after>_.*)?", re.IGNORECASE)
+#: The letters of DJI's cameras, by which the picture of the screen is told; others are those of a rig.
+_DJI_LETTERS = "TSVWZ"
 #: Folders of memory cards, below which a person's own are.
 _CARD_FOLDER = re.compile(r"DCIM|\d{3}[A-Z_]\w*", re.IGNORECASE)
 #: Sizes of thermal sensors, and those that makers enlarge them to (pixels).
@@ -73,12 +75,13 @@ def other_cameras(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 
 def _beside(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[str, str]]:
     """Pictures of a thermal camera and of the screen beside those of the same moment, as DJI names them: `_T` and `_S`
-    beside `_V`, `_W` or `_Z`, in one folder or sorted into several."""
+    beside larger `_V`, `_W` or `_Z`, in one folder or sorted into several. Rigs name their lenses by letters, too."""
     moments: dict[str, list[tuple[re.Match[str], ImageMetadata]]] = {}
     for photo in photographs:
         if match := _DJI_NAME.fullmatch(PurePosixPath(photo.name).stem):
             key = f"{match['before']} {match['number']} {match['after']}".upper()
             moments.setdefault(key, []).append((match, photo))
+    of_rigs = _numbers_of_rigs(photographs)
     thermal, screen = dict[str, str](), dict[str, str]()
     for shots in moments.values():
         for match, photo in shots:
@@ -90,11 +93,30 @@ def _beside(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[
                 for name, other in shots
                 if name["camera"].upper() in "VWZ" and _are_of_one_moment((match, photo), (name, other))
             ]
-            if camera == "T" and any(_is_larger(each, photo) for each in taken):
+            if not any(_is_larger(each, photo) for each in taken):
+                continue
+            if camera == "T":
                 thermal[photo.name] = f"is the thermal picture beside {taken[0].name}: {_REMEDY}"
-            elif camera == "S" and taken:
+            elif _may_be_by_dji(photo) and _number_of(photo)[0] not in of_rigs:
                 screen[photo.name] = f"is the picture of the screen beside {taken[0].name}"
     return thermal, screen
+
+
+def _may_be_by_dji(photo: ImageMetadata) -> bool:
+    """By its maker, or by its name: pictures of the screen may lack tags."""
+    return photo.camera.upper().startswith("DJI") or PurePosixPath(photo.name).name.upper().startswith("DJI_")
+
+
+def _number_of(photo: ImageMetadata) -> tuple[str, str]:
+    """What its name has around the letter of a camera, and that letter; both empty for other names."""
+    match = _LETTERED.fullmatch(PurePosixPath(photo.name).stem.upper())
+    return (f"{match['number']} {match['after'] or ''}", match["letter"]) if match else ("", "")
+
+
+def _numbers_of_rigs(photographs: Sequence[ImageMetadata]) -> set[str]:
+    """Numbers that a photograph has with the letter of a camera that DJI has not."""
+    named = map(_number_of, photographs)
+    return {number for number, letter in named if letter and letter not in _DJI_LETTERS}
 
 
 def _are_of_one_moment(*shots: tuple[re.Match[str], ImageMetadata]) -> bool:

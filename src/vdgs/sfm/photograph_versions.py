@@ -23,6 +23,8 @@ SMALLER = 0.7
 _COUNTED_NAME = re.compile(r"(.+?)(?:[ _]?\(\d{1,2}\)|[-_~]\d)")
 #: Programs may cut off the digits of parts of a second behind the second one.
 _SAME_SUBSECOND = 0.01
+#: And round focal lengths by so much (millimetres).
+SAME_FOCAL_MM = 0.1
 #: Programs that convert photographs may round places by so much (about a metre; choice).
 _ROUNDED_DEG = 1e-5
 #: Photographs show the same where the order of the gray values of their pixels correlates so well, by so many of them
@@ -36,7 +38,7 @@ Folder = Mapping[str, ImageMetadata]
 
 def versions(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """Photographs of which another version is among the others, with the reason."""
-    reasons = _smaller_copies(photographs) | _later_copies(photographs)
+    reasons = _cut_copies(photographs) | _smaller_copies(photographs) | _later_copies(photographs)
     return reasons | _versions_elsewhere([photo for photo in photographs if photo.name not in reasons])
 
 
@@ -66,6 +68,39 @@ def _is_copy(photo: ImageMetadata, other: ImageMetadata) -> bool:
     if _are_of_other_places(photo, other):
         return False
     return not taken_apart(photo, other) or _show_the_same([(photo, other)])
+
+
+def _cut_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Pictures that a program cut from a photograph of their name, camera and moment, which is there."""
+    stems: dict[tuple[str, ...], list[ImageMetadata]] = {}
+    for photo in photographs:
+        if photo.datetime and not photo.is_bare and photo.kind != "raw":
+            stem = PurePosixPath(photo.name).stem.lower()
+            stems.setdefault((stem, photo.camera, photo.datetime), []).append(photo)
+    reasons = {}
+    for alike in stems.values():
+        for photo in alike:
+            whole = next((other for other in alike if _is_cut_from(photo, other)), None)
+            if whole:
+                reasons[photo.name] = f"is cut from {whole.name}, by its name, moment and shape"
+    return reasons
+
+
+def _is_cut_from(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether a picture of the name, camera and moment of another is of another shape and has fewer pixels on a side,
+    more on none. Lenses of a rig may share all that."""
+    (short, longer), (whole_short, whole_longer) = sorted(photo.size), sorted(other.size)
+    lies_in = short <= whole_short and longer <= whole_longer
+    if not lies_in or same_aspect((longer, short), (whole_longer, whole_short)) or _are_of_a_rig(photo, other):
+        return False
+    if photo.focal_mm and other.focal_mm and abs(photo.focal_mm - other.focal_mm) > SAME_FOCAL_MM:
+        return False
+    return not taken_apart(photo, other) and _may_be_one_exposure(photo, other)
+
+
+def _are_of_a_rig(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    folders = [str(PurePosixPath(each.name).parent) for each in (photo, other)]
+    return all(may_be_sensor(folder) for folder in folders)
 
 
 def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
@@ -181,11 +216,15 @@ def _are_raw(folder: Folder) -> bool:
 
 
 def _is_one_exposure(one: ImageMetadata, other: ImageMetadata) -> bool:
-    known = bool(one.datetime and other.datetime) and not taken_apart(one, other)
-    stops = one.exposure_stops, other.exposure_stops
-    if stops[0] is not None and stops[1] is not None:  # of a bracket whose exposures were sorted into folders?
-        known &= abs(stops[0] - stops[1]) < SAME_STOPS
+    known = bool(one.datetime and other.datetime) and not taken_apart(one, other) and _may_be_one_exposure(one, other)
     return known and ("raw" in (one.kind, other.kind) or same_aspect(one.size, other.size))
+
+
+def _may_be_one_exposure(one: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether both have the same exposure, as far as they say it: of a bracket each may lie in a folder of its own."""
+    if one.exposure_stops is None or other.exposure_stops is None:
+        return True
+    return abs(one.exposure_stops - other.exposure_stops) < SAME_STOPS
 
 
 def _show_the_same(pairs: Sequence[tuple[ImageMetadata, ImageMetadata]]) -> bool:

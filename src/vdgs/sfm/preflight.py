@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from pathlib import PurePosixPath
 
 import numpy as np
 from shapely import MultiPoint
 
-from vdgs.sfm.flights import time_of, time_order
+from vdgs.sfm.flights import LEAST_PHOTOGRAPHS, flights_of, time_of, time_order
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -133,12 +135,35 @@ def _footprint(photographs: Sequence[ImageMetadata], height: float | None) -> tu
 def _overlap(
     photographs: Sequence[ImageMetadata], positions: GpsPriors, footprint: tuple[float, float] | None
 ) -> float | None:
-    """Along the flight, if the shorter side points forwards: from the steps between photographs in order of time."""
+    """Along the flight, if the shorter side points forwards: from the steps between photographs in order of time, of
+    each flight and camera for itself."""
     if footprint is None or len(positions) < 3:
         return None
-    order = time_order([photographs[index] for index in positions.image_indices.tolist()])
-    steps = np.linalg.norm(np.diff(positions.enu[order, :2], axis=0), axis=1)
+    taken = [photographs[index] for index in positions.image_indices.tolist()]
+    before = dict[int, int]()
+    pairs = list[tuple[int, int]]()
+    lenses = _lenses_of(taken)
+    for k in time_order(taken):
+        if lenses[k] in before:
+            pairs.append((before[lenses[k]], k))
+        before[lenses[k]] = k
+    if not pairs:
+        return None
+    first, second = np.array(pairs).T
+    steps = np.linalg.norm(positions.enu[second, :2] - positions.enu[first, :2], axis=1)
     return float(np.clip(1 - np.median(steps) / footprint[1], 0, 1))
+
+
+def _lenses_of(photographs: Sequence[ImageMetadata]) -> list[int]:
+    """The number of the flight and lens of each photograph: lenses of a rig are told by names that differ in more than
+    digits (DSC00001_W, DSC00001_E)."""
+    flights = flights_of(photographs).tolist()
+    words = [re.sub(r"\d", "", PurePosixPath(photo.name).stem) for photo in photographs]
+    counts = Counter(zip(flights, words, strict=True))
+    told = {flight for flight in flights if all(n >= LEAST_PHOTOGRAPHS for (f, _), n in counts.items() if f == flight)}
+    keys = [(flight, word if flight in told else "") for flight, word in zip(flights, words, strict=True)]
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return [numbers[key] for key in keys]
 
 
 def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None) -> float | None:

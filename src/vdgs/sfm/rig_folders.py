@@ -43,7 +43,9 @@ def with_sensors(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetada
     rigs: dict[str, dict[str, list[ImageMetadata]]] = {}
     for folder, members in folders.items():
         path = PurePosixPath(folder)
-        alike = len({(photo.camera, photo.size, photo.lens) for photo in members}) == 1  # one camera, as it was set
+        alike = (
+            len({(photo.camera, photo.size, photo.lens, photo.focal_mm) for photo in members}) == 1
+        )  # one camera, as it was set
         if _SENSOR.fullmatch(path.name) and alike and not any(photo.is_panorama for photo in members):
             rigs.setdefault(str(path.parent), {})[f"{folder}/"] = members
     sensor_of, notes = dict[str, str](), list[str]()
