@@ -92,7 +92,7 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
                 images=tuple(members),
                 model=first.camera_model,
                 is_confirmed=lens is None or lens.confirmed,
-                is_doubted=not first.face and (lens is None or bool(lens.doubt)),
+                is_doubted=not first.face and all(photo.lens is None or photo.lens.doubt for photo in members),
             )
         )
     return kinds
