@@ -34,7 +34,7 @@ def seen_with(folder: Path, size: tuple[int, int], count: int = 2) -> tuple[list
 
 
 @pytest.mark.parametrize(
-    ("size", "how"), [((100, 100), "cut only"), ((90, 110), "cut only"), ((64, 64), "shrunk"), ((128, 72), "cut only")]
+    ("size", "how"), [((100, 100), "cut only"), ((90, 110), "cut only"), ((64, 64), "shrunk"), ((128, 60), "cut only")]
 )
 def test_another_shape_that_is_smaller_on_both_sides_is_doubted_and_named(tmp_path, size, how):
     whole, cut = seen_with(tmp_path, size)
@@ -51,9 +51,11 @@ def test_another_shape_that_is_smaller_on_both_sides_is_doubted_and_named(tmp_pa
     assert any("DJI_0001.JPG, DJI_0002.JPG: of another shape than most of its camera" in each for each in warnings)
 
 
-@pytest.mark.parametrize("size", [(160, 90), (120, 120), (80, 45), (60, 60), (80, 60), (200, 200), (320, 240)])
+@pytest.mark.parametrize("size", [(160, 90), (120, 120), (80, 45), (60, 60), (80, 60), (200, 200), (320, 240),
+             (112, 63), (108, 72)])  # fmt: skip
 def test_modes_of_a_camera_are_not_doubted(tmp_path, size):
-    """The whole width or height of the sensor, with half the pixels across, too, or larger."""
+    """The whole width or height of the sensor, with half the pixels across, too, or larger; and stills of the size of
+    films, shrunk from the whole width."""
     _, other = seen_with(tmp_path, size)
     assert not any(photo.lens.doubt for photo in other)
 
@@ -111,6 +113,23 @@ def test_a_cut_copy_beside_its_whole_photograph_is_left_out(tmp_path, box, momen
     found = collect_images([tmp_path])
     assert [each.name for each in found.excluded] == ([f"cut/{name}" for name in names[:-1]] if left_out else [])
     assert all("is cut from orig/DJI_" in each.reason for each in found.excluded)
+
+
+def test_other_lenses_of_one_name_and_moment_are_no_cut_copies(tmp_path):
+    """A drone with two lenses and one serial number, in folders of any name: the pictures show other things."""
+    names = flight(tmp_path / "nadir")
+    (tmp_path / "oblique").mkdir()
+    for k, name in enumerate(names):
+        write_photograph(tmp_path / "oblique" / name, pixels(50 + k, 160, 100), k, np.array([10.0 * k, 0, 40]))
+    assert collect_images([tmp_path]).excluded == ()
+
+
+def test_a_cut_copy_that_was_shrunk_and_brightened_is_left_out(tmp_path):
+    names = flight(tmp_path / "orig")
+    with Image.open(tmp_path / "orig" / names[0]) as image:
+        shown = np.clip(np.asarray(image.crop((10, 20, 130, 110)).resize((96, 72))) * 1.1 + 5, 0, 255).astype(np.uint8)
+        picture(tmp_path / "small" / names[0], shown[:70], exif=image.getexif(), quality=92)
+    assert [each.name for each in collect_images([tmp_path]).excluded] == [f"small/{names[0]}"]
 
 
 def test_lenses_of_a_rig_with_other_sizes_are_no_cut_copies(tmp_path):

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -219,6 +219,15 @@ def test_moments_rise_along_a_film_whose_records_have_whole_seconds():
     gap = [block for k, block in enumerate(blocks) if not 10 < k < 80]
     at = [telemetry_at(read_telemetry(gap), t / 10).moment for t in range(32)]
     assert at == sorted(set(at))
+
+
+@pytest.mark.parametrize(("rate", "joined_s"), [(60, 0), (1, 1800)])
+def test_clocks_that_run_otherwise_than_the_film_are_left_alone(rate, joined_s):
+    """Hyperlapses, and films that a person joined."""
+    starts = [int(rate * k / 30) + joined_s * (k >= 60) for k in range(120)]
+    words = [str(datetime(2026, 6, 1, 10) + timedelta(seconds=each)) for each in starts]
+    records = read_telemetry([(k / 30, f"{word} [latitude: 47] [longitude: 8]") for k, word in enumerate(words)])
+    assert [str(record.moment) for record in records] == words
 
 
 def test_frames_are_apart_sharp_and_know_their_place(taken: tuple[ImageList, str]):

@@ -39,6 +39,13 @@ def test_focal_lengths_part_cameras_also_where_the_sensor_is_unknown(tmp_path, s
     assert not any(group.has_focal_prior for group in groups)
 
 
+@pytest.mark.parametrize("focals", [(4.15, 4.17), (3.6, 3.7, 3.9, 3.65, 3.8, 3.75), (24, 35, 24, 24, 24, 24)])
+def test_a_lens_that_follows_the_focus_and_a_zoom_of_few_photographs_are_one_camera(tmp_path, focals):
+    for k, name in enumerate(flight(tmp_path)):
+        of_unknown_sensor(tmp_path / name, focals[k % len(focals)])
+    assert len(group_by_camera(collect_images([tmp_path]).images)) == 1
+
+
 @pytest.mark.parametrize("letters", ["XWDSA", "VNSWE"])
 @pytest.mark.parametrize("name", ["DSC{:05d}_{}.JPG", "{1}/DSC{0:05d}_{1}.JPG", "DJI_{:04d}_{}.JPG"])
 @pytest.mark.parametrize("size", [(160, 120), (130, 100)])

@@ -365,6 +365,12 @@ def test_long_pictures_with_the_tags_of_one_photograph_are_left_out_where_name_o
     assert {photo.name for photo in found.images} == {*names, *([] if stitched else [name])}
 
 
+def test_long_frames_of_films_without_tags_are_not_taken_for_stitched(tmp_path):
+    for k in range(2 * COUNT):
+        picture(tmp_path / f"{k:04d}.jpg", pixels(k, *((280, 120) if k % 2 else (160, 120))))
+    assert len(collect_images([tmp_path]).images) == 2 * COUNT
+
+
 def test_flights_of_long_pictures_alone_are_used(tmp_path):
     for k in range(COUNT):
         write_photograph(tmp_path / f"pano_{k}.JPG", pixels(k, 280, 120), k, np.array((10.0 * k, 0.0, 40.0)))

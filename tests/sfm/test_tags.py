@@ -216,7 +216,7 @@ def test_the_reference_that_xmp_names_is_that_of_its_own_altitude(in_exif, words
         ({6: R(0, 0)}, 'drone-dji:AbsoluteAltitude="+545.00"',
          (545.0, "AbsoluteAltitude in XMP as recorded, datum not stated")),
         ({}, 'drone-dji:AbsoluteAltitude="+545.00" drone-dji:AltitudeType="RtkAlt"',
-         (545.0, "AbsoluteAltitude in XMP (RtkAlt) as recorded")),
+         (545.0, "RtkAlt as recorded")),
         ({5: b"\2", 6: 120.0}, "", (120.0, "EXIF GPSAltitude, above sea level (GPSAltitudeRef) as recorded")),
         ({5: b"\3", 6: 120.0}, "", (-120.0, "EXIF GPSAltitude, above sea level (GPSAltitudeRef) as recorded")),
         ({}, 'exif:GPSAltitude="12/1" exif:GPSAltitudeRef="2"',

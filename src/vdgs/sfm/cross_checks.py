@@ -20,6 +20,8 @@ from vdgs.sfm.stitched_pictures import stitched
 
 #: Focal lengths within this share of each other are one.
 ONE_FOCAL = 0.02
+#: Shapes of sensors and films: programs and cameras shrink pictures to them over the whole width.
+_SHAPES_OF_FILMS_AND_SENSORS = (16 / 9, 3 / 2, 4 / 3)
 #: Views whose tilt is this near to level may be those of a drone that records no angle (degrees).
 LEVEL_DEG = 1.0
 #: Fewer photographs do not tell a default from a measurement.
@@ -138,11 +140,13 @@ def _smaller_on_both_sides(photo: ImageMetadata, lens: Lens, usual: tuple[int, i
     shares = short / usual_short, longer / usual_longer
     whole = max(shares)  # how much it was shrunk if nothing but its shape was cut
     side, usual_side = (short, usual_short) if shares[0] == whole else (longer, usual_longer)
-    if whole >= 1 or usual_side % side == 0:
+    if whole >= 1 or usual_side % side == 0 or not _near(lens.focal, usual_lens.focal):
         return photo
     if 1 - min(shares) / whole < CUT:
         said = "smaller than most of its camera; its focal length is taken as if it was shrunk, not cut"
-        return replace(photo, doubts=(*photo.doubts, said)) if _near(lens.focal, usual_lens.focal) else photo
+        return replace(photo, doubts=(*photo.doubts, said))
+    if any(abs(longer / short / shape - 1) < CUT / 2 for shape in _SHAPES_OF_FILMS_AND_SENSORS):
+        return photo  # as exported over the whole width: stills of the size of films
     cut = whole > MAX_SHRUNK
     doubt = (
         f"of another shape than most of its camera, and shorter on both sides ({photo.width} x {photo.height} px, "

@@ -22,6 +22,12 @@ OTHER_M, MOST_APART_M = 1.0, 30.0
 #: What the references 2 and 3 of EXIF 3.0 say. 0 and 1 are above and below the ellipsoid there, but the sea in EXIF 2,
 #: and most cameras write them of either: they say nothing.
 SEA_LEVEL = "above sea level (GPSAltitudeRef)"
+#: Names in XMP of what altitudes are measured from.
+_REFERENCES = ("AltitudeType", "VertCS", "VERTCRS")
+#: What is said of altitudes that nothing more is said of.
+_NOT_STATED = "as recorded, datum not stated"
+#: Kinds that are one where both occur: of photographs that have both altitudes these agree, or the kind says otherwise.
+IN_EXIF, BY_MAKER = f"EXIF GPSAltitude {_NOT_STATED}", f"AbsoluteAltitude in XMP {_NOT_STATED}"
 #: Heights that differ by less (metres) are one number, written twice: near the sea, altitudes are nearly heights.
 SAME_HEIGHT_M = 0.2
 #: EXIF's tags: latitude and longitude, each behind its reference.
@@ -142,7 +148,7 @@ def read_altitudes(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Alti
         reference = None
     if value is None and (value := first_number(xmp, "exif:GPSAltitude")) is not None:
         reference, source = text(xmp, "exif:GPSAltitudeRef"), "exif:GPSAltitude in XMP"
-    mark = str(reference).strip("\x00 ")
+    mark = str(int(reference)) if reference in (1, 2, 3) else str(reference).strip("\x00 ")  # a ratio, text
     if value is not None and mark in ("1", "3"):
         value = -abs(value)
     datum = SEA_LEVEL if mark in ("2", "3") else ""
@@ -159,10 +165,11 @@ def read_altitudes(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> tuple[Alti
 
 
 def _own_altitude(xmp: Mapping[str, str]) -> tuple[float | None, str]:
-    """The altitude that the maker wrote into XMP alone, and its name."""
+    """The altitude that the maker wrote into XMP alone, and its name; that is empty where XMP names what it is measured
+    from, as beside EXIF's."""
     for name in ("AbsoluteAltitude", "sensefly:AltitudeWGS84", "AltitudeWGS84"):
         if (value := first_number(xmp, name)) is not None:
-            return value, f"{name} in XMP"
+            return value, "" if text(xmp, *_REFERENCES) else f"{name} in XMP"
     return None, ""
 
 
@@ -175,7 +182,7 @@ def _measured(
         return None, ""
     if value < LOWEST_M:
         return -value, f"{source or 'EXIF GPSAltitude'}, whose mark 'below sea level' cannot be true"
-    ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, "AltitudeType", "VertCS", "VERTCRS")
+    ellipsoidal, named = first_number(xmp, "AltitudeWGS84"), text(xmp, *_REFERENCES)
     if ellipsoidal is not None and abs(ellipsoidal - value) < SAME_M:
         return value, "above the WGS 84 ellipsoid (AltitudeWGS84)"
     if absolute and abs(value - absolute) >= OTHER_M:  # what XMP names is its own
@@ -187,7 +194,7 @@ def _measured(
         return value, f"{source or 'EXIF GPSAltitude'}, {datum} as recorded"
     if named and source:
         named = f"{source} ({named})"
-    return value, f"{named} as recorded" if named else f"{source or 'EXIF GPSAltitude'} as recorded, datum not stated"
+    return value, f"{named} as recorded" if named else f"{source or 'EXIF GPSAltitude'} {_NOT_STATED}"
 
 
 def _is_absolute_otherwise(value: float, absolute: float, xmp: Mapping[str, str]) -> bool:

@@ -18,6 +18,7 @@ from vdgs.captures.jpeg import with_end
 from vdgs.captures.pillow_limits import pillow_without_limits
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
+from vdgs.sfm.focal_length import lens_numbers
 from vdgs.sfm.image_list import ExcludedImage
 from vdgs.sfm.image_metadata import FISHEYE, RADIAL, ImageMetadata
 from vdgs.sfm.mask_files import apply_orientation
@@ -69,11 +70,16 @@ class CameraGroup:
 
 def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
     """Photographs by the cameras that they share, in the order of their first names; their numbers are 1, 2, ..."""
-    groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
+    alike: dict[tuple[object, ...], list[ImageMetadata]] = {}
     for photo in photographs:
-        focal = round(photo.lens.focal, 4) if photo.lens else f"{photo.focal_mm or 0:.2f} mm"
+        focal = round(photo.lens.focal, 4) if photo.lens else None
         key = (photo.camera, photo.size, focal, photo.camera_model, photo.face or photo.sensor)
-        groups.setdefault(key, []).append(photo)
+        alike.setdefault(key, []).append(photo)
+    groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
+    for key, members in alike.items():
+        lenses = lens_numbers([None if photo.lens else photo.focal_mm for photo in members])
+        for photo, number in zip(members, lenses, strict=True):
+            groups.setdefault((*key, number), []).append(photo)
     kinds = []
     for members in groups.values():
         first = members[0]

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 from vdgs.sfm.exif_gps import plain_text
@@ -29,6 +32,9 @@ SENSOR_MM = {
 DIAGONAL_35_MM = math.hypot(36, 24)
 #: Wider pictures than this are cut from a sensor of 4 x 3 (films' shape, on drones).
 MAX_SENSOR_ASPECT = 1.6
+#: Focal lengths in millimetres that lie apart by more than this share are of two lenses, where each has so many
+#: photographs (choice).
+OTHER_LENS, LEAST_OF_A_LENS = 0.1, 3
 #: Focal lengths over the longer side beyond these are damage.
 MIN_FOCAL, MAX_FOCAL = 0.2, 20.0
 _INCH, _CENTIMETRE, _MILLIMETRE = 25.4, 10.0, 1.0
@@ -356,6 +362,18 @@ def _used_width(model: str, width: float, height: float) -> float | None:
     across, down = SENSOR_MM[model]
     used = down * max(width, height) / min(width, height)
     return used if used < (1 - CUT) * across else across
+
+
+def lens_numbers(focals_mm: Sequence[float | None]) -> list[int]:
+    """Which of a camera's focal lengths in millimetres are of one lens, as numbers from 0: those that lie apart by
+    `OTHER_LENS` from all others, and are of `LEAST_OF_A_LENS` photographs each, are lenses of their own.
+
+    A zoom that was turned from photograph to photograph, and a lens whose focal length follows the focus, are one.
+    """
+    known = sorted({focal for focal in focals_mm if focal})
+    starts = [b for a, b in pairwise(known) if b > a * (1 + OTHER_LENS)]
+    numbers = [bisect_right(starts, focal) if focal else 0 for focal in focals_mm]
+    return numbers if min(Counter(numbers).values(), default=0) >= LEAST_OF_A_LENS else [0] * len(numbers)
 
 
 def _by_sensor(focal_mm: float | None, sensor_mm: float | None) -> float | None:

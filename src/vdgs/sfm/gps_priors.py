@@ -15,6 +15,7 @@ from vdgs.captures.gps_tables import GpsRow, read_gps_table
 from vdgs.captures.odd_positions import MIN_SPREAD_M, are_far_off, are_nowhere, do_not_spread, places_apart
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
+from vdgs.sfm.exif_gps import BY_MAKER, IN_EXIF
 from vdgs.sfm.flights import STEP_M, flights_of
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
@@ -202,6 +203,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
     if table is None:
         geodetic = np.array([(*(photo.lat_lon or (np.nan, np.nan)), _or_nan(photo.altitude)) for photo in photographs])
         kinds = [photo.altitude_type for photo in photographs]
+        kinds = [IN_EXIF if kind == BY_MAKER and IN_EXIF in kinds else kind for kind in kinds]
         return _without_default_altitudes(_Recorded(geodetic.reshape(-1, 3), kinds, "EXIF", [], {}), photographs)
     read = read_gps_table(table)
     names = [photo.name for photo in photographs]

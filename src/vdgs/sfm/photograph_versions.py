@@ -8,7 +8,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from vdgs.captures.image_files import open_image, same_aspect
@@ -30,6 +32,11 @@ _ROUNDED_DEG = 1e-5
 #: Photographs show the same where the order of the gray values of their pixels correlates so well, by so many of them
 #: (choice; five aerial photographs and themselves moved by 2 % of the width: 0.54 to 0.92).
 SAME_PICTURE, LOOKED_AT_PAIRS = 0.95, 3
+#: A picture that was cut from another is looked for in so small a one, in so many sizes, and found where gray values
+#: correlate so well (choice: every size is within a few per cent of one that is tried).
+_SEARCHED_PX, _SEARCHED_SIZES, _SAME_PART = 320, 24, 0.8
+#: Smaller parts are in any picture.
+_LEAST_PART_PX = 16
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)
 
@@ -95,7 +102,41 @@ def _is_cut_from(photo: ImageMetadata, other: ImageMetadata) -> bool:
         return False
     if photo.focal_mm and other.focal_mm and abs(photo.focal_mm - other.focal_mm) > SAME_FOCAL_MM:
         return False
-    return not taken_apart(photo, other) and _may_be_one_exposure(photo, other)
+    return not taken_apart(photo, other) and _may_be_one_exposure(photo, other) and _shows_part_of(photo, other)
+
+
+def _shows_part_of(photo: ImageMetadata, whole: ImageMetadata) -> bool:
+    """Whether a picture is somewhere in another, in any brightness and contrast: as large as there, or shrunk from as
+    much as its whole width or height."""
+    frame, shown = _small_gray(whole, _SEARCHED_PX / max(whole.size)), _gray(photo)
+    if frame is None or shown is None:
+        return False
+    least = max(frame.shape) / max(whole.size)
+    most = min(side / cut for side, cut in zip(frame.shape, shown.shape, strict=True))
+    for factor in np.geomspace(min(least, most), most, _SEARCHED_SIZES):
+        size = [max(1, int(side * factor)) for side in shown.shape[::-1]]
+        part = cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
+        if min(size) >= _LEAST_PART_PX and cv2.matchTemplate(frame, part, cv2.TM_CCOEFF_NORMED).max() >= _SAME_PART:
+            return True
+    return False
+
+
+def _gray(photo: ImageMetadata) -> UInt8[np.ndarray, "h w"] | None:
+    """Gray values of an upright picture; None for one that Pillow does not read."""
+    try:
+        with open_image(photo.path) as image:
+            return np.asarray(ImageOps.exif_transpose(image).convert("L"))
+    except (OSError, SyntaxError, ValueError):
+        return None
+
+
+def _small_gray(photo: ImageMetadata, factor: float) -> UInt8[np.ndarray, "h w"] | None:
+    """The same, shrunk by a factor below 1."""
+    gray = _gray(photo)
+    if gray is None or factor >= 1:
+        return gray
+    size = [max(1, round(side * factor)) for side in gray.shape[::-1]]
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
 
 def _are_of_a_rig(photo: ImageMetadata, other: ImageMetadata) -> bool:

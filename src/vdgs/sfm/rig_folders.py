@@ -12,6 +12,7 @@ import numpy as np
 from vdgs.captures.name_resolution import match_key
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.sfm.flights import time_of
+from vdgs.sfm.focal_length import lens_numbers
 from vdgs.sfm.image_metadata import ImageMetadata
 
 #: What folders of the cameras of a rig are called. Folders of a memory card (100MEDIA, 101MEDIA) are none.
@@ -43,9 +44,8 @@ def with_sensors(photographs: Sequence[ImageMetadata]) -> tuple[list[ImageMetada
     rigs: dict[str, dict[str, list[ImageMetadata]]] = {}
     for folder, members in folders.items():
         path = PurePosixPath(folder)
-        alike = (
-            len({(photo.camera, photo.size, photo.lens, photo.focal_mm) for photo in members}) == 1
-        )  # one camera, as it was set
+        one = len({(photo.camera, photo.size, photo.lens) for photo in members}) == 1  # camera, as it was set
+        alike = one and len(set(lens_numbers([photo.focal_mm for photo in members]))) == 1
         if _SENSOR.fullmatch(path.name) and alike and not any(photo.is_panorama for photo in members):
             rigs.setdefault(str(path.parent), {})[f"{folder}/"] = members
     sensor_of, notes = dict[str, str](), list[str]()

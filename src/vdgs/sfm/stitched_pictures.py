@@ -21,7 +21,7 @@ def stitched(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     usual, found = _usual_sizes(photographs), dict[str, str]()
     for photo in photographs:
         size = usual[photo.camera]
-        if _shape(photo.size) < _LONG_SHAPE or _shape(size) >= _LONG_SHAPE or photo.is_panorama:
+        if _shape(photo.size) < _LONG_SHAPE or _shape(size) >= _LONG_SHAPE or photo.is_panorama or photo.is_bare:
             continue
         named = _NAMED.search(PurePosixPath(photo.name).stem) is not None
         if named or max(photo.size) > max(size):
