@@ -11,81 +11,43 @@ from PIL import Image
 
 from support.flights import write_photograph
 from support.small_flights import COUNT, flight, picture, pixels
-from vdgs.config.sfm_options import SfmOptions
-from vdgs.sfm.cross_checks import cross_checked
-from vdgs.sfm.feature_extraction import CameraGroup, group_by_camera
-from vdgs.sfm.gps_priors import read_gps_priors
+from vdgs.sfm.cut_pictures import cut_pictures
 from vdgs.sfm.image_list import collect_images
-from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.incremental_mapper import ASKED, fit_doubted, should_fix_focal
-from vdgs.sfm.preflight import make_preflight_report
-from vdgs.system.lazy_pycolmap import pycolmap
 
 WHOLE = (160, 120)
 
 
-def seen_with(folder: Path, size: tuple[int, int], count: int = 2) -> tuple[list[ImageMetadata], list[ImageMetadata]]:
-    """A flight in which some photographs have another size, as if EXIF's size was rewritten; whole ones, and those."""
+def left_out_of(folder: Path, size: tuple[int, int], count: int = 2) -> list[str]:
+    """The photographs of a flight that are left out where some have another size, to which a program cut them and wrote
+    EXIF's anew."""
     flight(folder)
     images = list(collect_images([folder]).images)
     images[:count] = [replace(photo, width=size[0], height=size[1]) for photo in images[:count]]
-    checked = cross_checked(images)
-    return checked[count:], checked[:count]
+    return list(cut_pictures(images))
+
+
+def test_pictures_that_were_cut_are_named_with_the_size_of_the_others(tmp_path):
+    for k, name in enumerate(flight(tmp_path)[:2]):
+        write_photograph(tmp_path / name, pixels(k, 100, 100), k, np.array([10.0 * k, 0, 40]))
+    said = [(each.name, each.reason) for each in collect_images([tmp_path]).excluded]
+    assert [name for name, _ in said] == ["DJI_0001.JPG", "DJI_0002.JPG"]
+    assert all("100 x 100 px, others 160 x 120" in reason and "Give it as" in reason for _, reason in said)
+
+
+@pytest.mark.parametrize("size", [(100, 100), (90, 110), (72, 72), (128, 60)])
+def test_pictures_that_are_cut_on_both_sides_are_left_out_where_they_are_few(tmp_path, size):
+    assert left_out_of(tmp_path / "few", size) == ["DJI_0001.JPG", "DJI_0002.JPG"]
+    assert left_out_of(tmp_path / "half", size, COUNT // 2) == []  # another mode of the camera?
 
 
 @pytest.mark.parametrize(
-    ("size", "how"), [((100, 100), "cut only"), ((90, 110), "cut only"), ((64, 64), "shrunk"), ((128, 60), "cut only")]
+    "size",
+    [(160, 90), (120, 120), (80, 45), (60, 60), (80, 60), (200, 200), (320, 240), (120, 90), (112, 63), (108, 72)],
 )
-def test_another_shape_that_is_smaller_on_both_sides_is_doubted_and_named(tmp_path, size, how):
-    whole, cut = seen_with(tmp_path, size)
-    pixels_of = {photo.lens.focal * max(photo.size) for photo in cut}
-    expected = whole[0].lens.focal * (max(WHOLE) if how == "cut only" else max(size))
-    assert [*pixels_of] == [pytest.approx(expected)]
-    assert all(f"as if it was {how}" in photo.doubts[-1] and photo.lens.doubt for photo in cut)
-    assert not any(photo.doubts for photo in whole)
-    positions = read_gps_priors([*cut, *whole], None, (1.0, 2.0))
-    assert should_fix_focal([*cut, *whole], positions, SfmOptions())[0]
-    assert [group.is_doubted for group in group_by_camera([*cut, *whole])] == [True, False]
-    listed = replace(collect_images([tmp_path]), images=(*cut, *whole))
-    warnings = make_preflight_report(listed, positions).warnings
-    assert any("DJI_0001.JPG, DJI_0002.JPG: of another shape than most of its camera" in each for each in warnings)
-
-
-@pytest.mark.parametrize("size", [(160, 90), (120, 120), (80, 45), (60, 60), (80, 60), (200, 200), (320, 240),
-             (112, 63), (108, 72)])  # fmt: skip
-def test_modes_of_a_camera_are_not_doubted(tmp_path, size):
-    """The whole width or height of the sensor, with half the pixels across, too, or larger; and stills of the size of
-    films, shrunk from the whole width."""
-    _, other = seen_with(tmp_path, size)
-    assert not any(photo.lens.doubt for photo in other)
-
-
-def test_the_same_shape_is_taken_as_shrunk_and_that_is_said(tmp_path):
-    whole, small = seen_with(tmp_path, (120, 90))
-    assert {photo.lens for photo in small} == {whole[0].lens}
-    assert all("as if it was shrunk, not cut" in photo.doubts[-1] for photo in small)
-
-
-@pytest.mark.parametrize("why", ["one height", ASKED])
-def test_a_doubted_focal_length_alone_is_fitted_where_those_of_the_others_are_held(why):
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 1, 6, 150
-    model = pycolmap.synthesize_dataset(options)
-    true = [model.cameras[k].focal_length for k in (1, 2)]
-    model.cameras[2].focal_length *= 1.2
-    as_held = pycolmap.BundleAdjustmentOptions()
-    as_held.print_summary, as_held.refine_focal_length = False, False
-    pycolmap.bundle_adjustment(model, as_held)  # what a mapper makes of it
-    groups = [
-        CameraGroup(
-            camera="", width=0, height=0, focal_px=true[0], has_focal_prior=True, source="", images=(),
-            is_doubted=doubted,
-        )
-        for doubted in (False, True)
-    ]  # fmt: skip
-    fit_doubted(model, (True, why), groups, 1)
-    assert model.cameras[1].focal_length == true[0]
-    assert (model.cameras[2].focal_length == pytest.approx(true[1], rel=0.01)) is (why != ASKED)
+def test_modes_of_a_camera_are_used(tmp_path, size):
+    """The whole width or height of the sensor, with half the pixels across, too, or larger; stills of the size of
+    films, shrunk from the whole width; and what was shrunk alone."""
+    assert left_out_of(tmp_path, size) == []
 
 
 def cut_copy(folder: Path, name: str, file: Path, box: tuple[int, int, int, int], moment: str = "") -> None:

@@ -215,15 +215,13 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
         left_out = f"; {metadata.positions_rejected} positions not trusted" if metadata.positions_rejected else ""
         rows.append(("Position residuals", f"RMS {by_axis(metadata.residual_rms_m)}{left_out}"))
     rows += _survey_rows(metadata)
+    held = "held" if metadata.focal_fixed else "fitted"
     for camera in metadata.cameras:
-        how = f"{'held' if metadata.focal_fixed else 'fitted'}: {metadata.focal_reason}"
-        if metadata.focal_fixed and not math.isclose(camera.focal_after_px, camera.focal_before_px, rel_tol=1e-4):
-            how = "fitted: unknown or doubted; those of the others are held"
         rows.append(
             (
                 "Lens",
                 f"{camera.name}: focal length {camera.focal_before_px:.0f} px by {camera.focal_source}, "
-                f"{camera.focal_after_px:.0f} px now ({how}), k "
+                f"{camera.focal_after_px:.0f} px now ({held}: {metadata.focal_reason}), k "
                 f"{camera.radial_distortion:+.4f}",
             )
         )

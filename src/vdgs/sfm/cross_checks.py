@@ -10,9 +10,10 @@ import numpy as np
 from PIL import Image
 
 from vdgs.captures.image_files import open_image
+from vdgs.sfm.cut_pictures import cut_pictures
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
-from vdgs.sfm.focal_length import CUT, EQUIVALENT, MAX_SHRUNK, Lens, unzoomed, zoomed
+from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import BODY, GIMBAL, ImageMetadata, looks_backwards
 from vdgs.sfm.other_cameras import other_cameras
 from vdgs.sfm.photograph_versions import versions
@@ -20,8 +21,6 @@ from vdgs.sfm.stitched_pictures import stitched
 
 #: Focal lengths within this share of each other are one.
 ONE_FOCAL = 0.02
-#: Shapes of sensors and films: programs and cameras shrink pictures to them over the whole width.
-_SHAPES_OF_FILMS_AND_SENSORS = (16 / 9, 3 / 2, 4 / 3)
 #: Views whose tilt is this near to level may be those of a drone that records no angle (degrees).
 LEVEL_DEG = 1.0
 #: Fewer photographs do not tell a default from a measurement.
@@ -112,8 +111,7 @@ def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
 
 def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
     """Photographs that share the shorter side with most of their camera and lack some of the longer one were cut by a
-    program, which leaves the focal length in pixels as it was. What those of another shape lack on both sides was cut,
-    and perhaps shrunk: their focal length is doubted."""
+    program, which leaves the focal length in pixels as it was."""
     known = [photo for photo in group if photo.lens is not None]
     if not known:
         return group
@@ -126,36 +124,8 @@ def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
             doubt = "cut to another shape than most of its camera; the focal length in pixels is taken as theirs"
             focal = usual_lens.focal * max(size) / longer
             photo = replace(photo, lens=replace(lens, focal=focal), doubts=(*photo.doubts, doubt))
-        elif lens and usual_lens and lens.focal_mm == usual_lens.focal_mm and not (lens.doubt or lens.remark):
-            photo = _smaller_on_both_sides(photo, lens, size, usual_lens)
         found.append(photo)
     return found
-
-
-def _smaller_on_both_sides(photo: ImageMetadata, lens: Lens, usual: tuple[int, int], usual_lens: Lens) -> ImageMetadata:
-    """The photograph, with a doubt of its lens if it has another shape than the `usual` size of its camera, is shorter
-    on both sides, and no mode of the camera: those have its whole width or height, at half the pixels perhaps. One of
-    the same shape is taken as shrunk, and that is said."""
-    (short, longer), (usual_short, usual_longer) = sorted(photo.size), sorted(usual)
-    shares = short / usual_short, longer / usual_longer
-    whole = max(shares)  # how much it was shrunk if nothing but its shape was cut
-    side, usual_side = (short, usual_short) if shares[0] == whole else (longer, usual_longer)
-    if whole >= 1 or usual_side % side == 0 or not _near(lens.focal, usual_lens.focal):
-        return photo
-    if 1 - min(shares) / whole < CUT:
-        said = "smaller than most of its camera; its focal length is taken as if it was shrunk, not cut"
-        return replace(photo, doubts=(*photo.doubts, said))
-    if any(abs(longer / short / shape - 1) < CUT / 2 for shape in _SHAPES_OF_FILMS_AND_SENSORS):
-        return photo  # as exported over the whole width: stills of the size of films
-    cut = whole > MAX_SHRUNK
-    doubt = (
-        f"of another shape than most of its camera, and shorter on both sides ({photo.width} x {photo.height} px, "
-        f"others {usual[0]} x {usual[1]}): it was cut, and perhaps shrunk; the focal length is a guess, as if it "
-        f"was {'cut only' if cut else 'shrunk'}. Give it as the camera took it, or leave it out"
-    )
-    focal = usual_lens.focal * usual_longer / longer if cut else lens.focal
-    lens = replace(lens, focal=focal, doubt=doubt)
-    return replace(photo, lens=lens, doubts=(*photo.doubts, doubt))
 
 
 def _near(one: float, other: float) -> bool:
@@ -221,6 +191,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     """
     reasons = other_cameras(photographs) | stitched(photographs)
     reasons |= versions([photo for photo in photographs if photo.name not in reasons])
+    reasons |= cut_pictures([photo for photo in photographs if photo.name not in reasons])
     tagged = [photo for photo in photographs if not photo.is_bare]
     bare = [photo for photo in photographs if photo.is_bare and photo.name not in reasons]
     lent = dict[str, ImageMetadata]()

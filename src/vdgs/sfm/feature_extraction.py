@@ -64,8 +64,6 @@ class CameraGroup:
     """COLMAP's model of the lens."""
     is_confirmed: bool = True
     """False where one tag alone says the focal length."""
-    is_doubted: bool = False
-    """Whether nothing says the focal length, or what says it is doubted."""
 
 
 def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
@@ -98,7 +96,6 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
                 images=tuple(members),
                 model=first.camera_model,
                 is_confirmed=lens is None or lens.confirmed,
-                is_doubted=not first.face and all(photo.lens is None or photo.lens.doubt for photo in members),
             )
         )
     return kinds

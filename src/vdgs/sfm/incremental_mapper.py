@@ -78,7 +78,7 @@ def _by_lenses(photographs: Sequence[ImageMetadata]) -> tuple[bool, str] | None:
     few = max(1, FEW * len(photographs))
     if sum(photo.lens is None for photo in photographs) > few:
         return False, "nothing says it for some photographs"
-    if 2 * sum(bool(photo.lens and photo.lens.doubt) for photo in photographs) > len(photographs):
+    if sum(bool(photo.lens and photo.lens.doubt) for photo in photographs) > few:
         return False, "what the photographs say of it contradicts itself"
     return None
 
@@ -140,8 +140,7 @@ def is_contradicted(
 ) -> bool:
     """Whether the focal length of a model was held at what one tag alone says, and the photographs plainly say another:
     programs that shrink photographs rewrite what tags count from."""
-    alone = [group.has_focal_prior and not (group.is_confirmed or group.is_doubted) for group in groups]
-    said = {k: group.focal_px for k, (group, one) in enumerate(zip(groups, alone, strict=True), 1) if one}
+    said = {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
     if not held[0] or held[1] == ASKED or not said:
         return False
     fitted = pycolmap.Reconstruction(model)
@@ -154,37 +153,11 @@ def is_contradicted(
     )
 
 
-def fit_doubted(
-    model: pycolmap.Reconstruction, held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
-) -> None:
-    """Fit the lenses of a model whose focal lengths are doubted, where those of the others are held: the others tell
-    the shape of the ground, and that tells these."""
-    if not held[0] or held[1] == ASKED:
-        return
-    sure = {number for number in model.cameras if not groups[number - 1].is_doubted}
-    if len(sure) in (0, len(model.cameras)):
-        return
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in placed_images(model):
-        config.add_image(image.image_id)
-    for number in sure:
-        config.set_constant_cam_intrinsics(number)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_bundle_adjuster(_fit_options(threads), config, model)
-    call_cancellable(lambda cancellation_token: adjuster.solve())
-    model.update_point_3d_errors()
-
-
-def _fit_options(threads: int) -> pycolmap.BundleAdjustmentOptions:
+def _fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
+    """Fit the focal lengths of a model, with all else that is fitted."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary, options.ceres.solver_options.num_threads = False, threads
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    return options
-
-
-def _fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
-    """Fit the focal lengths of a model, with all else that is fitted."""
-    options = _fit_options(threads)
     call_cancellable(lambda cancellation_token: pycolmap.bundle_adjustment(model, options))
     model.update_point_3d_errors()
 

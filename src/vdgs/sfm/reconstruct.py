@@ -357,7 +357,6 @@ def _mapped(
     if not workspace.is_begun("model", anew):
         models = _models(plan, workspace, key, count, held[0], console)
         held = incremental_mapper.release_focal(models, held, plan.threads)
-        incremental_mapper.fit_doubted(models[0], held, kinds, plan.threads)
         if workspace.is_done("focal", key):
             return models, held
         if not incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
