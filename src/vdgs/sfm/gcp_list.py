@@ -340,6 +340,8 @@ def _half_a_list(lines: Sequence[str]) -> str:
     words, second = (re.split(r"[\s,;]+", line) for line in (lines[0], lines[min(1, len(lines) - 1)]))
     if _PHOTOGRAPH.search(words[0]) and len(words) > 3 and all(map(_is_number, words[2:4])):
         return "a table of marks without the coordinates of their points"
+    if names_a_system(lines[0]):  # WKT names axes as tables name columns
+        return ""
     columns = known_columns(re.split(r"[,;\t]", lines[0]))
     named = {"x", "y"} <= set(columns) or {"lat", "lon"} <= set(columns)
     numbered = len(words) > 3 and all(map(_is_number, words[1:4]))
