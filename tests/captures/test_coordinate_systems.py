@@ -78,6 +78,36 @@ def test_columns_that_say_metres_are_metres_under_any_system(tmp_path, system, m
     assert not any("feet" in note for note in read[1].notes)
 
 
+@pytest.mark.parametrize(
+    ("system", "place", "is_metres", "said"),
+    [
+        (
+            "EPSG:2263",
+            (990000, 190000),
+            False,
+            "in the unit of EPSG:2263 .*foot.*: as metres, .* 509 km outside of the",
+        ),
+        ("EPSG:2263", (301752, 57912), True, ""),
+        ("EPSG:2263", (3e7, 3e7), True, "as metres, as their headings say, and not in the unit of EPSG:2263"),
+        ("EPSG:6350", (1000, 1500), True, ""),  # metres of its own
+        ("+proj=utm +zone=19 +south +units=us-ft", (350000, 6290000), True, "and not in the unit of .*foot"),
+    ],
+)
+def test_the_place_tells_feet_from_metres_where_headings_say_metres_of_any_system(
+    tmp_path, system, place, is_metres, said
+):
+    """Programs write [m] behind x and y, be they in feet."""
+    read, factor = [], 1 if system == "EPSG:6350" or not is_metres else 3937 / 1200
+    for names, given in (("x,y", np.multiply(place, factor)), ("X[m],Y[m]", np.array(place))):
+        x, y = map(repr, given.tolist())
+        (tmp_path / "t.csv").write_text(f"{system}\nname,{names},Z[m]\na.jpg,{x},{y},80\n")
+        read.append(read_gps_table(tmp_path / "t.csv"))
+    assert read[1].rows[0].position == pytest.approx(read[0].rows[0].position, abs=1e-9)
+    notes = [note for note in read[1].notes if "headings" in note]
+    assert len(notes) == bool(said)
+    assert re.search(said, "".join(notes))
+
+
 def test_metres_of_a_law_are_those_of_the_system_and_of_degrees_none(tmp_path):
     for system, place in (("EPSG:29371", "100000,-2500000"), ("EPSG:4258", "11.5,48.1")):  # German legal metres
         places = []

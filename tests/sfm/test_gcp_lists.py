@@ -136,6 +136,50 @@ def test_a_system_in_a_comment_and_decimal_commas_between_blanks_are_read(flight
         assert read_gcp_list(file, collection, ()).points == sound.points
 
 
+SITE = (
+    "# Site North / targets",
+    "# 2024",
+    "# EPSG:32718 before",
+    "# WGS84 positions of the drone were not used",
+    "# of / b",
+)
+
+
+@pytest.mark.parametrize("remark", SITE)
+@pytest.mark.parametrize("system", ["CRS: EPSG:4258", "ETRS89"])
+def test_a_comment_never_stands_in_for_a_line_that_names_a_system(flight, tmp_path, remark, system):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    marks = [(k, name) for k in range(3) for name in flight.names[:2]]
+    rows = [f"{9 + k / 1e3} {47 + k**2 / 1e3} 30 9 9 {name} {k}" for k, name in marks]
+    file.write_text("\n".join([remark, system, *rows]))
+    found = read_gcp_list(file, collection, ())
+    assert found.crs == "ETRS89"
+    assert found.points[0].geodetic[:2] == pytest.approx((47, 9), abs=1e-5)
+    file.write_text("\n".join([remark, "Some old datum", *rows]))
+    with pytest.raises(CaptureError, match="'Some old datum' names none"):
+        read_gcp_list(file, collection, ())
+
+
+def test_of_comments_above_the_points_those_that_define_a_system_count(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    file.write_text(plain := listed(flight))
+    sound = read_gcp_list(file, collection, ())
+    _, *lines = plain.splitlines()
+    import pyproj
+
+    wkt = pyproj.CRS("EPSG:32719").to_wkt("WKT1_GDAL", pretty=True).splitlines()
+    names = ("EPSG:32719",), ("WGS 84 / UTM zone 19S",), ("WGS84 UTM 19S # of May",), tuple(wkt)
+    remarks = "Site North / targets", "2024", "WGS84 positions of the drone were not used", "a / b"
+    for name in names:
+        for heading in ((), ("geo_x geo_y geo_z im_x im_y image_name",)):
+            above = [f"# {text}" for text in (*remarks, *name, *remarks)]
+            file.write_text("\n".join([*above, *heading, *lines]))
+            assert read_gcp_list(file, collection, ()).points == sound.points
+    file.write_text("\n".join([*(f"# {text}" for text in remarks), *lines]))
+    with pytest.raises(CaptureError, match=f"'{lines[0][:30]}.*' names none"):
+        read_gcp_list(file, collection, ())
+
+
 def test_points_without_a_name_take_none_of_another(flight, tmp_path):
     text = listed(flight, *({"name": name} for name in ("", "", "Point~1", "Point~1", "", "")))
     (file := tmp_path / "gcp_list.txt").write_text(text.replace(" ", "\t").replace("~", " "))
@@ -155,6 +199,19 @@ def test_metres_under_a_system_in_feet_are_metres(flight, tmp_path):
     one, other = (np.array([point.geodetic for point in each.points]) for each in found)
     assert other == pytest.approx(one, abs=1e-9)
     assert "feet" not in found[1].crs
+
+
+def test_feet_whose_headings_say_metres_are_told_by_their_place(flight, tmp_path):
+    collection, file = collect_images([flight.folder]), tmp_path / "gcp_list.txt"
+    marks, found = [(k, name) for k in range(3) for name in flight.names[:2]], []
+    for heading in ("x,y", "X[m],Y[m]"):
+        rows = [f"{990000 + 100 * k},{190000 + 50 * k**2},30,9,9,{name},{k}" for k, name in marks]
+        file.write_text("\n".join(["EPSG:2263", f"{heading},Z[m],px,py,photograph,name", *rows]))
+        found.append(read_gcp_list(file, collection, ()))
+    assert found[0].points == found[1].points
+    assert not any("headings" in note for note in found[0].notes)
+    assert any("as metres, as their headings say, they would lie 509 km outside" in note for note in found[1].notes)
+    assert "heights are taken as metres" in found[1].crs
 
 
 @pytest.mark.parametrize(("heading", "height"), [("z (ft)", 600), ("z", 600), ("z [m]", 182.88)])

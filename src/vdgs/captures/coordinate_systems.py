@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from textwrap import shorten
@@ -44,8 +44,6 @@ UNKNOWN_DATUM_M = 300.0
 ELSEWHERE_M = 50.0
 #: A datum that moves places by less (degrees) is WGS 84 for PROJ.
 _SAME_DEG = 1e-8
-#: Units that differ by less (share) are one: feet and metres of one system are of the survey, of a law, or not.
-_SAME_UNIT = 5e-5
 #: Systems are used so far outside of the area that they are made for (metres): a zone for a whole country (choice).
 OUTSIDE_M = 600_000.0
 #: Ellipsoids of datums that agree with WGS 84 to a metre or two.
@@ -319,6 +317,19 @@ def outside_area(header: str, geodetic: Float[np.ndarray, "n 3"]) -> list[str]:
     ]
 
 
+def meters_outside_area(header: str, x: float, y: float) -> float:
+    """How far a place lies from the area that a system which `to_geodetic` knows is made for, in metres; 0 inside,
+    infinite for no place on Earth, NaN where the system names no area. x (east) and y (north) in the system's units."""
+    import pyproj
+
+    crs = pyproj.CRS.from_user_input(pyproj_name(header))
+    area = _area_of(crs)
+    if area is None:
+        return math.nan
+    latitude, longitude, *_ = map(float, _to_latitude(_horizontal(crs), "EPSG:4326")(x, y))
+    return meters_outside(area, latitude, longitude) if math.isfinite(latitude + longitude) else math.inf
+
+
 def _area_of(crs: Any) -> Any | None:
     """The area that a system is made for, or of several parts the first that names one."""
     return next((part.area_of_use for part in (crs, *crs.sub_crs_list) if part.area_of_use is not None), None)
@@ -353,29 +364,6 @@ def is_in_degrees(header: str) -> bool:
     import pyproj
 
     return bool(pyproj.CRS.from_user_input(pyproj_name(header)).is_geographic)
-
-
-def in_units_of(header: str, meters: float | None, file: Path) -> float:
-    """Units of x and y of a system that `to_geodetic` knows in one of a column whose name says so many `meters`; 1 for
-    a column that says nothing (None). Raises CaptureError for a system in degrees, but of metres: programs write these
-    behind the names of x and y whatever they are."""
-    if meters is None:
-        return 1.0
-    import pyproj
-
-    crs = pyproj.CRS.from_user_input(pyproj_name(header))
-    if _horizontal(crs).is_geographic:
-        if meters == 1:
-            return 1.0
-        raise CaptureError(f"{file}: its columns name a unit of length, but {header[:60]} counts in degrees.")
-    factor = meters / float(crs.axis_info[0].unit_conversion_factor)
-    return 1.0 if abs(factor - 1) < _SAME_UNIT else factor
-
-
-def named_in_units(system: str, across: Sequence[float | None], up: float | None) -> str:
-    """The name of a system by `to_geodetic` without what is assumed of feet, where headings say (metres in one) another
-    unit of heights than metres, or metres of x and y."""
-    return system.removesuffix(HEIGHTS_IN_METERS) if up not in (None, 1) or 1 in across else system
 
 
 def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:

@@ -55,6 +55,8 @@ class Columns(NamedTuple):
     """Metres in one of each of its accuracies, NaN for angles."""
     across_units: tuple[float | None, float | None] = (None, None)
     """Metres (of angles degrees) in one of x and of y; None where their names say no unit: then it is the system's."""
+    unit_note: str = ""
+    """What is said of the unit of x and y, where headings and system may both be meant."""
     angles: Mapping[str, Heading] = MappingProxyType({})
     """The headings of latitudes and longitudes."""
     o_side: str = ""

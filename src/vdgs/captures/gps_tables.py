@@ -17,12 +17,11 @@ import numpy as np
 
 from vdgs.captures.angles import degrees_of_text
 from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
+from vdgs.captures.column_units import believed_units, in_units_of, named_in_units
 from vdgs.captures.coordinate_systems import (
     ToGeodetic,
     datum_error,
     height_unit,
-    in_units_of,
-    named_in_units,
     outside_area,
     to_geodetic,
 )
@@ -121,14 +120,14 @@ def read_gps_table(file: Path) -> GpsTable:
     placed = [row for row in rows if _has_place(row, columns)]
     if not placed:
         raise CaptureError(f"{file}: none of its {len(rows)} rows has a position. Export the table once it has them.")
-    positions, system_name = _positions(placed, columns, file)
+    positions, columns, system_name = _positions(placed, columns, file)
     found = [
         GpsRow(row.number, row.words[columns.where["name"]], position, _deviations(row, columns))
         for row, position in zip(placed, positions, strict=True)
     ]
     headings = all_rows[0].words if len(rows) < len(all_rows) else None
     notes = _column_notes(columns, headings, rows, file.name)
-    notes += [f"{file.name}: {note}" for note in _height_notes(columns, system_name)]
+    notes += [f"{file.name}: {note}" for note in _unit_notes(columns, system_name)]
     datum_error_m, converted = 0.0, ""
     if columns.system is not None:
         datum_error_m, converted = datum_error(columns.system, np.array(positions))
@@ -169,9 +168,10 @@ def _column_notes(columns: Columns, headings: list[str] | None, rows: Sequence[R
     return notes
 
 
-def _height_notes(columns: Columns, system: str) -> list[str]:
-    """Which of several altitudes is read, and what the name of the system says in doubt of it."""
-    notes = list[str]()
+def _unit_notes(columns: Columns, system: str) -> list[str]:
+    """The unit of x and y where it is in doubt, which of several altitudes is read, and what the name of the system
+    says in doubt of it."""
+    notes = [columns.unit_note] if columns.unit_note else []
     if columns.heights:
         read, *others = map(repr, columns.heights)
         notes.append(f"altitudes are those of the column {read}, not of {', '.join(others)}.")
@@ -203,19 +203,25 @@ def _has_place(row: Row, columns: Columns) -> bool:
     return bool(_word(row, columns, "name")) and all(_word(row, columns, what).lower() not in UNKNOWN for what in both)
 
 
-def _positions(rows: Sequence[Row], columns: Columns, file: Path) -> tuple[list[tuple[float, float, float]], str]:
-    """Latitude, longitude and altitude of each row, and the name of the system that they are given in; "" where the
-    table names none. Raises CaptureError."""
-    if columns.system is None:
-        return _geodetic(rows, columns, file), ""
-    change, name = to_geodetic(columns.system, file)
+def _positions(
+    rows: Sequence[Row], columns: Columns, file: Path
+) -> tuple[list[tuple[float, float, float]], Columns, str]:
+    """Latitude, longitude and altitude of each row, the columns with the units that are believed, and the name of the
+    system that they are given in; "" where the table names none. Raises CaptureError."""
+    system = columns.system
+    if system is None:
+        return _geodetic(rows, columns, file), columns, ""
+    change, name = to_geodetic(system, file)
     # Here, once: PROJ takes tens of milliseconds to read a system.
-    columns = columns._replace(system_altitude_unit=height_unit(columns.system))
+    columns = columns._replace(system_altitude_unit=height_unit(system))
     if "x" in columns.where:
-        return _projected(rows, columns, change, name, file), name
+        across = np.array([[number_of(_word(row, columns, what)) for what in ("x", "y")] for row in rows])
+        units, note = believed_units(system, columns.across_units, across, file)
+        columns = columns._replace(across_units=units, unit_note=note)
+        return _projected(rows, columns, change, name, file), columns, name
     positions = _geodetic(rows, columns, file)
     changed = change(np.array(positions)[:, [1, 0, 2]] / [1, 1, columns.system_altitude_unit])
-    return [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)], name
+    return [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)], columns, name
 
 
 def _geodetic(rows: Sequence[Row], columns: Columns, file: Path) -> list[tuple[float, float, float]]:

@@ -14,6 +14,8 @@ _STARTS = re.compile(
 #: Codes in whatever stands around them: `EPSG:32633+5773`, `EPSG=32633`, `UTM zone 33N (EPSG::32633)`, addresses.
 _CODES = re.compile(r"(?:EPSG|SRID)(?:\.io/|\.xml#|[\s:=_-]{0,3})(\d{4,6}(?:\+\d{4,6})?)(?!\d|\.)", re.I)
 _WKT = re.compile(r"\w*(CS|CRS)\[", re.I)
+#: What `pyproj_name` makes of codes, of WGS 84 and its zones, and definitions.
+_DEFINITION = re.compile(r"(EPSG|ESRI):\d|urn:|https?://|\+|\w*(CS|CRS)\[", re.I)
 #: A line that may be a name alone: no table of words, no numbers on their own.
 _WORDS = re.compile(r"(?!.*(^|\s)[\d.]+\s+[\d.])[A-Za-z][^,;\t]{2,60}")
 #: Lists of photographs begin so; PROJ looks half a second for a name that it does not know.
@@ -32,6 +34,15 @@ def names_a_system(line: str) -> bool:
     if _STARTS.match(line):
         return True
     return bool(_WORDS.fullmatch(line)) and not _FILE_NAME.search(line) and _is_name(line)
+
+
+def defines_a_system(line: str) -> bool:
+    """Whether a line that may as well be a remark names a system: by a code, a definition, or words that are all of the
+    name, no number alone and no words that only look like one (`North / targets`)."""
+    if not names_a_system(line):
+        return False
+    name = pyproj_name(line)
+    return bool(_DEFINITION.match(name)) or ("/" in name and _is_name(name))
 
 
 @cache

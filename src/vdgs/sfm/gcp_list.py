@@ -13,17 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.column_units import believed_units, in_units_of, named_in_units
 from vdgs.captures.coordinate_systems import (
     datum_error,
     height_unit,
-    in_units_of,
-    named_in_units,
     outside_area,
     to_geodetic,
 )
 from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.name_resolution import NameLookup, find_one
-from vdgs.captures.system_names import join_definition, names_a_system
+from vdgs.captures.system_names import defines_a_system, join_definition, names_a_system
 from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, number_of, told_meters
 from vdgs.captures.text_tables import Line, read_lines, rows_of, separator_of, with_decimal_points
 from vdgs.errors import CaptureError
@@ -43,6 +42,8 @@ ALL_POINTS = "all"
 CHECK_PREFIX = "CHK-"
 #: Points higher above or below the sea are none (metres).
 _MAX_HEIGHT_M = 20_000.0
+#: A line of the list, or of names of its columns, has so many words: x, y, z and a mark.
+_LEAST_WORDS = 5
 #: How names of photographs end.
 _PHOTOGRAPH = re.compile(r"\.(jpe?g|tiff?|png|dng|heic|webp)$", re.I)
 #: Marks of one point in one photograph that are farther apart are of different things (pixels; choice).
@@ -131,7 +132,7 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
-    header, lines, transform, system = _listed(file)
+    header, lines, transform, system, note = _listed(file)
     by_name = photographs_by_name(collection)
     lines, strange = _of_photographs(lines, by_name, file)
     found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
@@ -146,7 +147,7 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
         seen = tuple(sighting for _, sighting in group if sighting is not None)
         is_check_point = ALL_POINTS in held_out or name in held_out or name.startswith(CHECK_PREFIX)
         points.append(GroundControlPoint(name, geodetic, seen, is_check_point))
-    strange += [f"{file.name}: {said}" for said in _said_of_points(points, lines)]
+    strange += [f"{file.name}: {said}" for said in ([note] if note else []) + _said_of_points(points, lines)]
     places = np.array([point.geodetic for point in points])
     strange += [f"{file.name}: {said}" for said in outside_area(header, places)]
     error_m, converted = datum_error(header, places)
@@ -162,15 +163,20 @@ class _Listed(NamedTuple):
     transform: Any
     """From the system to WGS 84."""
     system: str
+    note: str
+    """What is said of the unit of x and y."""
 
 
 def _listed(file: Path) -> _Listed:
     header, rows, (across, along, up) = _rows(file)
     transform, system = to_geodetic(header, file)
-    system = named_in_units(system, (across, along), up)
     height = 1.0 if up is None else up / height_unit(header)
-    units = in_units_of(header, across, file), in_units_of(header, along, file), height
-    return _Listed(header, [_line(row, file, units) for row in rows], transform, system)
+    lines = [_line(row, file, height) for row in rows]
+    places = np.array([line.place[:2] for line in lines]).reshape(-1, 2)
+    units, note = believed_units(header, (across, along), places, file)
+    wide, long = (in_units_of(header, unit, file) for unit in units)
+    lines = [replace(line, place=(line.place[0] * wide, line.place[1] * long, line.place[2])) for line in lines]
+    return _Listed(header, lines, transform, named_in_units(system, units, up), note)
 
 
 def _by_point(found: Sequence[_Marked]) -> list[tuple[str, list[_Marked]]]:
@@ -282,14 +288,30 @@ def _rows(file: Path) -> tuple[str, list[Row], tuple[float | None, float | None,
 
 
 def _lines_below_system(file: Path) -> list[Line]:
-    """The line that names the coordinate system, be it a comment where the first other line names none, and those below
-    it without comments."""
+    """The line that names the coordinate system, and those below it without comments. Where the first line is of the
+    list already, the last comment above that defines a system; any other first line is meant to name it."""
     lines = [line._replace(text=line.text.strip()) for line in read_lines(file, "list of control points")]
     body = [line for line in lines if not line.text.startswith("#")]
-    if not body or names_a_system(body[0].text):
+    if not body or names_a_system(body[0].text) or not _is_of_list(body[0].text):
         return body
-    above = (line._replace(text=line.text.lstrip("# ")) for line in lines if line.number < body[0].number)
-    return [*itertools.islice((line for line in above if names_a_system(line.text)), 1), *body]
+    above = [line.text.lstrip("# ") for line in lines if line.number < body[0].number]
+    system, k = list[Line](), 0
+    while k < len(above):
+        text, count = join_definition(above[k:])
+        if defines_a_system(text):
+            system = [Line(lines[k].number, text)]
+        k += count
+    return [*system, *body]
+
+
+def _is_of_list(text: str) -> bool:
+    """Whether a line is a mark, or the names of columns, and no name of a system."""
+    words = re.split(r"[\s,;]+", text)
+    if len(words) < _LEAST_WORDS:
+        return False
+    is_named = [word[-1:].lower() for word in words[:3]] == ["x", "y", "z"]  # `geo_x geo_y geo_z`, as ODM names them
+    known = known_columns(rows_of([Line(1, text)])[0].words)
+    return is_named or len(known) > 1 or sum(map(_is_number, words[:5])) > 2
 
 
 def _check_is_list(lines: Sequence[str], file: Path) -> None:
@@ -318,6 +340,8 @@ def _half_a_list(lines: Sequence[str]) -> str:
     words, second = (re.split(r"[\s,;]+", line) for line in (lines[0], lines[min(1, len(lines) - 1)]))
     if _PHOTOGRAPH.search(words[0]) and len(words) > 3 and all(map(_is_number, words[2:4])):
         return "a table of marks without the coordinates of their points"
+    if names_a_system(lines[0]):  # WKT names axes as tables name columns
+        return ""
     columns = known_columns(re.split(r"[,;\t]", lines[0]))
     named = {"x", "y"} <= set(columns) or {"lat", "lon"} <= set(columns)
     numbered = len(words) > 3 and all(map(_is_number, words[1:4]))
@@ -356,7 +380,8 @@ def _number(word: str) -> float:
     return float(word) if math.isnan(found) else found
 
 
-def _line(row: Row, file: Path, units: tuple[float, ...]) -> _Line:
+def _line(row: Row, file: Path, height: float) -> _Line:
+    """What a line says, its height times `height`."""
     number, words = row
     try:
         flat = words[2].strip().lower() in UNKNOWN or number_of(words[2]) in NO_DATA
@@ -372,7 +397,7 @@ def _line(row: Row, file: Path, units: tuple[float, ...]) -> _Line:
     if not all(map(math.isfinite, (x, y, z, across, down))):
         raise CaptureError(f"{file}: line {number}: numbers must be finite. Mend the line.")
     name = words[6].strip() if len(words) > 6 else ""
-    place = x * units[0], y * units[1], math.nan if flat else z * units[2]  # the one NaN: places of it are equal
+    place = x, y, math.nan if flat else z * height  # the one NaN: places of it are equal
     return _Line(number, place, (across, down), photograph, name)
 
 
