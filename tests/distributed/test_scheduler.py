@@ -28,6 +28,7 @@ from vdgs.distributed.scheduler import ExecutionPolicy, run_tasks
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.file_locks import lock_folder
 from vdgs.system.memory.memory_estimate import block_workload, decoded_image_bytes, estimate_memory
 
 GB = 10**9
@@ -166,6 +167,41 @@ def test_a_card_has_no_more_tasks_at_once_than_it_has_room_for(tmp_path):
         policy = ExecutionPolicy(2 * each, poll_seconds=1e-6, max_per_device=each)
         assert [found.state for found in run_tasks(tasks, Cards([]), policy, TaskListener())] == ["done"] * 8
         assert most == dict.fromkeys(("cuda:0", "cuda:1"), each)
+
+
+@pytest.mark.parametrize(("at_once", "cards"), [(1, ("", "")), (2, ("", "")), (2, ("cuda:0", "cuda:1"))])
+def test_what_another_command_works_on_is_begun_after_all_else(tmp_path, at_once, cards):
+    """It waits in its place, which nothing else of the run may need then, however long it was waited for before."""
+
+    class Engine(Scripted):
+        def _next(self):
+            return Slow(AttemptResult(0))
+
+    class Slow(Attempt):
+        polls = 0
+
+        def poll(self):
+            self.polls += 1
+            return self.end if self.polls > 2 else None
+
+    folders = [tmp_path / f"{place:02d}" for place in range(6)]
+    tasks = [
+        Task(
+            name=folder.name, command=["train"], output=tmp_path / "output.log", folder=folder,
+            resources=TaskResources(device=cards[place % 2]),
+        )
+        for place, folder in enumerate(folders)
+    ]  # fmt: skip
+    engine, heard = Engine([]), Heard()
+    policy = ExecutionPolicy(at_once, poll_seconds=1e-6, lock_timeout_seconds=0, max_per_device=1)
+    with lock_folder(folders[0]), lock_folder(folders[2]):
+        found = run_tasks(tasks, engine, policy, heard)
+    begun = [name for name, _, _ in engine.asked]
+    assert [each.state for each in found] == ["done"] * 6
+    assert sorted(begun) == [task.name for task in tasks]
+    of_card = [name for name in begun if not cards[0] or int(name) % 2 == 0]  # where they could take another's place
+    assert of_card[-2:] == ["00", "02"]
+    assert sum("waiting for another process" in line for line in heard.lines) == 2
 
 
 def test_what_the_system_refuses_is_named(tmp_path):

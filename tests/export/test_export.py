@@ -153,18 +153,34 @@ def test_what_a_map_says_of_its_system_files_say_too(export, tmp_path: Path, mon
     pytest.importorskip("pyproj")
     said = io.StringIO()
     monkeypatch.setattr(sys.modules[__name__], "QUIET", Console(file=said, width=1000))
-    files = export("a.points.ply", "b.splat", "tileset.json", origin=PLACE, crs=crs)["files"]
+    files = export("a.points.ply", "b.splat", "c.ply", "tileset.json", origin=PLACE, crs=crs)["files"]
     placement = MapProjection.of(ground(PLACE), crs)
     assert bool(placement.notes) == (note is not None)
     assert all(re.search(note, each) for each in placement.notes[-1:])
-    assert f"a.points.ply, b.splat: {placement.name}; heights {placement.height_reference}\n" in said.getvalue()
-    for file in files[:2]:
-        assert (file["crs_name"], file["heights"]) == (placement.name, placement.height_reference)
+    assert f"a.points.ply, c.ply: {placement.name}; heights {placement.height_reference}\n" in said.getvalue()
+    assert f"b.splat: {placement.name}; x west, y down, z south\n" in said.getvalue()
+    for file in files[:3]:
+        assert file["crs_name"] == placement.name
+        assert file["heights"] == (None if file["file"].endswith(".splat") else placement.height_reference)
         assert file["notes"][: len(placement.notes)] == list(placement.notes)
     for each in placement.notes:  # once for all files
         assert said.getvalue().count(each) == 1
-        assert each not in files[2]["notes"]  # on the globe, whatever the map
-    assert "horizon plane" in files[2]["heights"]
+        assert each not in files[3]["notes"]  # on the globe, whatever the map
+    assert files[3]["crs_name"].startswith("Earth-centered")
+    assert files[3]["heights"] is None
+
+
+def test_axes_are_named_as_files_record_them_and_heights_only_where_the_third_goes_up(export, tmp_path: Path):
+    names = ["a.ply", "a.points.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog", "a.rad", "a.glb"]
+    found = {Path(file["file"]).name: file for file in export(*names, origin=PLACE)["files"]}
+    assert list(found) == names
+    for name, file in found.items():
+        beside, content = tmp_path / f"{name}.json", (tmp_path / name).read_bytes()
+        assert file["axes"].encode() in (beside.read_bytes() if beside.exists() else content[:6000])
+        assert (file["heights"] is not None) == file["axes"].endswith("z up")
+    for axes, up in (("y-up", False), ("z-up", True)):
+        (file,) = export("b.ply", origin=PLACE, axes=axes)["files"]
+        assert (file["heights"] is not None) == up
 
 
 def test_the_usual_system_is_named(export, tmp_path: Path):

@@ -18,17 +18,24 @@ from rich.console import Console
 from experiments.bench.worker import BenchJob, run_job
 from support.captures import tiny_scene, write_colmap
 from support.flights import write_photograph
+from support.hand_made_models import model_at, quadrants
 from vdgs.captures.capture_metadata import capture_metadata
 from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
+from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.presets import PRESETS
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
+from vdgs.distributed.shard import Shard
+from vdgs.distributed.sharded_job import REQUEST
 from vdgs.errors import RunError
+from vdgs.model.anchor_model import ModelMetadata
+from vdgs.partition.blocks import save_blocks
 from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.merge_blocks import merge_run_blocks
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
+from vdgs.pipeline.train_block import train_shard
 from vdgs.runs.create_or_resume import create_or_resume_run, exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -172,6 +179,21 @@ def test_a_block_that_another_command_trains_is_waited_for(run):
         with run.block(0).locked(on_wait=lambda: listener.write("waits")):
             assert is_locked(run.block(0).path)
     assert listener.getvalue() == "waits"
+
+
+def test_a_worker_of_a_run_waits_for_another_command_that_trains_its_block(run):
+    """`vdgs train-blocks RUN` beside `vdgs run`: the block is no failure of the run."""
+    keys, block = run.keys(), run.block(0)
+    write_json(run.partition / "partition.json", {"key": keys.partition, "assignment_key": keys.assignment})
+    save_blocks(run.partition / "blocks.geojson", quadrants(), [{}] * 4)
+    replace(model_at([[0.0, 0.0, 0.0]], seed=0), metadata=ModelMetadata(key=keys.blocks, block=0)).save(block.model)
+    write_json(run.block(0).path.parent / REQUEST, {"worker": "block", "request": to_dict(CheckpointOptions())})
+    with held_elsewhere(block.path) as release:
+        listener = Listener(release)
+        train_shard(Shard(run.block(0).path.parent, 0, "cpu", 1.0, Console(file=listener, width=1000)))
+    said = listener.getvalue()
+    assert f"{block.path}: another vdgs process trains this block; waiting for it" in said
+    assert "already trained; nothing to do" in said
 
 
 @pytest.mark.parametrize("shared", [True, False])

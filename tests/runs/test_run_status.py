@@ -26,10 +26,10 @@ from vdgs.config.method import MergeConfig, MethodConfig
 from vdgs.config.presets import PRESETS
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import ModelMetadata
-from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line
+from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line, status_json
 from vdgs.report.write_report import write_report
-from vdgs.runs.model_integrity import load_verified
-from vdgs.runs.open_run import open_model, open_run
+from vdgs.runs.model_integrity import load_verified, map_verified
+from vdgs.runs.open_run import locate_model, open_model, open_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_MODEL, OTHER_PARTITION, OTHER_SETTINGS, get_run_status
@@ -262,18 +262,57 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
         load_verified(run.merged, run.keys().merge, 0)
 
 
-def test_a_model_that_the_system_does_not_let_be_read_is_not_to_be_deleted(run, monkeypatch):
-    unreadable, opened = run.block(0).model, Path.open
+#: What the system answers where a model is not to be read, and what is to be done then.
+REFUSALS = [
+    (PermissionError(errno.EACCES, "Permission denied"), "Allow it: chmod +r"),
+    (OSError(errno.ESTALE, "Stale file handle"), "See to its disk"),
+    (OSError(errno.EIO, "Input/output error"), "See to its disk"),
+]
 
-    def refuse(path, *arguments, **others):
-        if path == unreadable:
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+@pytest.fixture
+def refuse(monkeypatch):
+    """Lets the system answer so where a file is opened."""
+    opened, refused = Path.open, dict[Path, OSError]()
+
+    def open_or_refuse(path, *arguments, **others):
+        if path in refused:
+            raise refused[path]
         return opened(path, *arguments, **others)
 
-    monkeypatch.setattr(Path, "open", refuse)
-    status = get_run_status(run)
-    assert (status.of("block 0").state, status.next_command()) == ("unknown", "")
-    assert next_line(status) == f"to mend: {unreadable}: Permission denied"
+    monkeypatch.setattr(Path, "open", open_or_refuse)
+    return refused.__setitem__
+
+
+@pytest.mark.parametrize(("error", "remedy"), REFUSALS)
+@pytest.mark.parametrize("stage", ["coarse", "block 0", "merge"])
+def test_a_model_that_cannot_be_read_puts_nothing_out_of_date(run, refuse, stage, error, remedy):
+    """Nothing says that it is another one; what was made of it stands as its record says."""
+    model = {"coarse": run.coarse, "block 0": run.block(0), "merge": run.merged}[stage].model
+    refuse(model, error)
+    assert states(run) == {stage: "unknown"}
+    status, facts = get_run_status(run), status_json(run)
+    assert status.next_command() == ""
+    assert next_line(status).startswith(f"to mend: {model}: cannot be read ({error.strerror}). {remedy}")
+    assert (facts["next_command"], facts["problem"]) == (None, status.problem)
+    warning = locate_model(run).warning
+    assert "gain" not in warning
+    assert (str(model) in warning) == (stage == "merge")
+
+
+@pytest.mark.parametrize(("error", "remedy"), REFUSALS)
+def test_a_model_that_cannot_be_read_is_named_and_not_to_be_deleted(run, refuse, error, remedy):
+    refuse(run.merged.model, error)
+    for read in (load_verified, map_verified):
+        with pytest.raises(RunError) as raised:
+            read(run.merged, run.keys().merge)
+        said = str(raised.value)
+        assert said.startswith(f"{run.merged.model}: cannot be read ({error.strerror}). {remedy}")
+        assert "elete" not in said
+
+
+def test_a_run_that_can_be_read_has_no_problem(run):
+    assert status_json(run)["problem"] is None
 
 
 @pytest.fixture

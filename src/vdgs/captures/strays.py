@@ -111,9 +111,8 @@ def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:
 
 def _refuse(error: OSError) -> None:
     """Raise CaptureError for a folder whose files cannot be listed or read."""
-    folder, fault = Path(error.filename), f"cannot be read ({error.strerror}). See its disk"
-    said = refusal(folder, error) if isinstance(error, PermissionError) else fault
-    raise CaptureError(f"{folder}: the folder {said}, or move it elsewhere.")
+    folder = Path(error.filename)
+    raise CaptureError(f"{folder}: the folder {refusal(folder, error)}, or move it elsewhere.")
 
 
 def is_hidden(name: PurePath) -> bool:

@@ -163,19 +163,30 @@ class _TaskScheduler:
             self._listener.on_paused(state.task, "")
 
     def _start_ready(self) -> None:
-        ready = list[_TaskState]()
+        """Begin what there is room for; what another process works on comes last, as it only waits in its place."""
+        ready, locked = list[_TaskState](), list[_TaskState]()
         for state in list(self._waiting):
             before = self._by_name.get(state.task.after) if state.task.after is not None else None
             end = before.result if before is not None else None
-            has_room = len(self._running) + len(ready) < self._max_concurrent and not self._is_full(state.task, ready)
             if end is not None and end.state != "done":
                 self._waiting.remove(state)
                 self._start(ready)
                 self._end(state, end.state, f"{end.name} {end.state}: {end.reason}")
-            elif has_room and (before is None or end is not None) and not self._is_locked_elsewhere(state):
+            elif (before is None or end is not None) and self._has_room(state.task, ready):
+                if self._is_locked_elsewhere(state):
+                    locked.append(state)
+                    continue
+                self._waiting.remove(state)
+                ready.append(state)
+        for state in locked:
+            if self._was_waited_for(state) and self._has_room(state.task, ready):
                 self._waiting.remove(state)
                 ready.append(state)
         self._start(ready)
+
+    def _has_room(self, task: Task, ready: Sequence[_TaskState]) -> bool:
+        """Whether a task can run beside those that run and those that are to be started."""
+        return len(self._running) + len(ready) < self._max_concurrent and not self._is_full(task, ready)
 
     def _is_full(self, task: Task, ready: Sequence[_TaskState]) -> bool:
         """Whether the device of a task has as many others as it has room for."""
@@ -199,13 +210,21 @@ class _TaskScheduler:
                 self._report_start(state)
 
     def _is_locked_elsewhere(self, state: _TaskState) -> bool:
-        """Another process works on the task, and the time to wait for it is not over (then the task itself fails)."""
+        """Whether another process works on the task; what waits for it is told once."""
         if state.task.folder is None or not StageFolder(state.task.folder).is_locked_elsewhere():
             return False
         if state.locked_since is None:
             state.locked_since = time.monotonic()
             self._listener.on_waiting(state.task)
-        return time.monotonic() - state.locked_since < self._policy.lock_timeout_seconds
+        return True
+
+    def _was_waited_for(self, state: _TaskState) -> bool:
+        """Whether the time to wait here for who works on a locked task is over: then the task itself waits on, as that
+        of a block does, or fails and says why."""
+        return (
+            state.locked_since is not None
+            and time.monotonic() - state.locked_since >= self._policy.lock_timeout_seconds
+        )
 
     def _stop(self, kill: bool) -> None:
         if not self._stopping:

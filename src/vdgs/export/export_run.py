@@ -28,8 +28,8 @@ from vdgs.export.bake_plan import drop_unused_sh_degrees
 from vdgs.export.color_refinement import BakedGaussians
 from vdgs.export.distributed_bake import DistributedBake, distributed_bake, forget_shards
 from vdgs.export.export_loss import measure_loss, views_to_measure
+from vdgs.export.file_coordinates import FileCoordinates, axes_of_file, coordinates_of_file
 from vdgs.export.formats import registry
-from vdgs.export.formats.axes import EARTH_CENTERED
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialView
 from vdgs.export.formats.gaussian_store import GaussianStore
 from vdgs.export.gaussian_optimization import optimize_gaussians
@@ -79,7 +79,6 @@ class _BakedScene:
         to_local = frame.points_to_local if registry.format_from_path(path).only_points else frame.to_local
         chunks = (to_local(piece) for piece in self.pieces(rows))
         bounds, page = local_bounds(frame, self.spool.means[rows]), _view_in_frame(self.page, frame)
-        axes = EARTH_CENTERED if frame.is_geocentric else axes_for(path, self.request)
         return ExportScene(
             chunks=chunks,
             count=len(rows),
@@ -87,7 +86,7 @@ class _BakedScene:
             metadata=frame.facts,
             bounds=bounds,
             page=page,
-            axes=axes,
+            axes=axes_of_file(path, frame, self.request),
             spz_version=self.request.spz_version,
         )
 
@@ -191,7 +190,7 @@ def write_files(
     frames = {path: frame_for_file(path, run, request, center) for path in request.output}
     for path in _all_outputs(request):
         check_takes_files(path.parent)
-    _print_systems(frames, console)
+    _print_systems({path: coordinates_of_file(path, frame, request) for path, frame in frames.items()}, console)
     _tidy(request.output, console)
     began = time.monotonic()
     page = make_initial_view(run, int(request.html_max_mb * 1e6))
@@ -235,16 +234,16 @@ def write_files(
     return record
 
 
-def _print_systems(frames: Mapping[Path, LocalFrame], console: Console) -> None:
+def _print_systems(systems: Mapping[Path, FileCoordinates], console: Console) -> None:
     """Say before the work in which coordinates the files stand, and what is to be known of each system: a choice of
     `--crs` that was wrong should not be paid for."""
-    files = dict[tuple[str, str, tuple[str, ...]], list[str]]()
-    for path, frame in frames.items():
-        files.setdefault((frame.name, frame.height_reference, frame.notes), []).append(path.name)
-    for (name, heights, notes), names in files.items():
-        console.print(f"{', '.join(names)}: {name}; heights {heights}", markup=False, highlight=False)
-        for note in notes:
-            console.print(f"[yellow]note[/] {escape(note)}", highlight=False)
+    files = dict[FileCoordinates, list[str]]()
+    for path, system in systems.items():
+        files.setdefault(system, []).append(path.name)
+    for system, names in files.items():
+        console.print(f"{', '.join(names)}: {system.text}", markup=False, highlight=False)
+    for note in dict.fromkeys(note for system in files for note in system.notes):
+        console.print(f"[yellow]note[/] {escape(note)}", highlight=False)
 
 
 def _write_fitting(
@@ -257,7 +256,8 @@ def _write_fitting(
         scene, rows = replace(scene, spool=merging.merged(count).spool), np.arange(count)
     if not registry.format_from_path(path).only_points and (note := frame.departure_note(scene.spool.means[rows])):
         notes.append(note)
-    return _write(path, frame, scene.scene(frame, rows, path), merging.console, notes)
+    system = coordinates_of_file(path, frame, scene.request)
+    return _write(path, system, scene.scene(frame, rows, path), merging.console, notes)
 
 
 def _capacity(path: Path, scene: _BakedScene) -> int:
@@ -337,7 +337,9 @@ def _check_written_once(paths: Sequence[Path]) -> None:
             raise VdgsError(f"--output {path} and --output {other}: both write {file}. Choose another folder for one.")
 
 
-def _write(path: Path, frame: LocalFrame, scene: ExportScene, console: Console, notes: Sequence[str]) -> ExportedFile:
+def _write(
+    path: Path, system: FileCoordinates, scene: ExportScene, console: Console, notes: Sequence[str]
+) -> ExportedFile:
     began = time.monotonic()
     lost = [*notes, *registry.write_scene(path, scene)]
     seconds, size = time.monotonic() - began, _size(path)
@@ -345,7 +347,8 @@ def _write(path: Path, frame: LocalFrame, scene: ExportScene, console: Console, 
     for each in lost:
         console.print(f"[yellow]note[/] {path.name}: {each}", highlight=False)
     return {"file": str(path.resolve()), "gaussians": scene.count, "bytes": size, "seconds": seconds,
-            "crs_name": frame.name, "heights": frame.height_reference, "notes": [*frame.notes, *lost]}  # fmt: skip
+            "crs_name": system.name, "axes": system.axes, "heights": system.heights,
+            "notes": [*system.notes, *lost]}  # fmt: skip
 
 
 def _size(path: Path) -> int:

@@ -95,7 +95,8 @@ def status_json(run: RunFolder) -> RunStatusDocument:
     return {
         "run": str(run.path), "place": None if place is None else to_jsonable(record_to_dict(place)),
         "complete": status.is_complete, "running": status.is_running,
-        "next_command": status.next_command() or None, "stages": [_stage_json(stage) for stage in status.stages],
+        "next_command": status.next_command() or None, "problem": status.problem or None,
+        "stages": [_stage_json(stage) for stage in status.stages],
     }  # fmt: skip
 
 

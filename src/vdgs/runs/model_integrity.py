@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vdgs.errors import RunError
 from vdgs.model.model_metadata import read_model_metadata
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.system.permissions import refusal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,16 +50,18 @@ def _size_agrees(stage: StageFolder) -> bool:
 def load_verified(stage: StageFolder, key: str, block: int | None = None) -> AnchorModel:
     """The model of a finished stage, of these settings and of this block.
 
-    Raises RunError for a file that the stage did not make, however it came there; VdgsError for one that is damaged.
+    Raises RunError for a file that the stage did not make, however it came there, and for one that the system does not
+    let be read; VdgsError for one that is damaged.
     """
     from vdgs.model.anchor_model import AnchorModel
     from vdgs.system.tensors import file_id
 
-    model = AnchorModel.load(stage.model)
-    error = integrity_error(stage, key, block)
-    if not error and stage.status().model_id not in (None, file_id(stage.model)):
-        error = MODEL_MISMATCH
-    _refuse(stage, error)
+    with _reading(stage):
+        error = integrity_error(stage, key, block)
+        model = AnchorModel.load(stage.model)
+        if not error and stage.status().model_id not in (None, file_id(stage.model)):
+            error = MODEL_MISMATCH
+        _refuse(stage, error)
     return model
 
 
@@ -65,8 +70,25 @@ def map_verified(stage: StageFolder, key: str) -> AnchorModel:
     are checked. Raises as `load_verified`."""
     from vdgs.model.anchor_model import AnchorModel
 
-    _refuse(stage, integrity_error(stage, key))
-    return AnchorModel.load(stage.model, checked=False)
+    with _reading(stage):
+        _refuse(stage, integrity_error(stage, key))
+        return AnchorModel.load(stage.model, checked=False)
+
+
+@contextmanager
+def _reading(stage: StageFolder) -> Iterator[None]:
+    """Raise RunError where the system does not let the model be read: nothing then says that it is a wrong one."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise RunError(f"{stage.model}: is not there. Put it back, or give the command that made it again.") from error
+    except OSError as error:
+        raise RunError(f"{unreadable_text(stage, error)}, then give the command again.") from error
+
+
+def unreadable_text(stage: StageFolder, error: OSError) -> str:
+    """What to say where the system does not let a model be read; without a full stop."""
+    return f"{stage.model}: {refusal(stage.model, error)}"
 
 
 def _refuse(stage: StageFolder, error: str) -> None:

@@ -19,7 +19,7 @@ from vdgs.partition.assignment.score_file import load_scores
 from vdgs.partition.blocks import Blocks, load_blocks
 from vdgs.runs.model_integrity import load_verified, map_verified
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.run_status import get_run_status
+from vdgs.runs.run_status import RunStatus, get_run_status
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
 from vdgs.system.atomic_files import read_json
 from vdgs.system.quoting import shell_word
@@ -138,10 +138,16 @@ def locate_model(folder: RunFolder, which: ModelName = "best") -> ModelLocation:
 def _missing_model_text(folder: RunFolder, name: str) -> str:
     """Why a model cannot be opened, and what to do."""
     run_status = get_run_status(folder)
-    stage, command = run_status.of("merge" if name == "merged" else "coarse"), run_status.next_command()
+    stage = run_status.of("merge" if name == "merged" else "coarse")
     why = f"state: {stage.state}" + (f", {stage.reason}" if stage.reason else "")
-    remedy = f"Next: {command}" if command else run_status.problem or "A process works on it: wait for it."
-    return f"{folder.path}: has no {name} model of its settings yet ({why}). {remedy}"
+    return f"{folder.path}: has no {name} model of its settings yet ({why}). {_next_text(run_status)}"
+
+
+def _next_text(run_status: RunStatus) -> str:
+    """What to do next about a run that is not finished."""
+    if command := run_status.next_command():
+        return f"Next: {command}"
+    return f"To mend: {run_status.problem}" if run_status.problem else "A process works on it: wait for it."
 
 
 def _warning(folder: RunFolder, name: str) -> str:
@@ -150,11 +156,12 @@ def _warning(folder: RunFolder, name: str) -> str:
     merged = run_status.of("merge")
     if merged.state == "done":
         return merged.reason
-    remedy = f"Next: {command}" if (command := run_status.next_command()) else "A process works on the run."
+    if merged.problem:
+        return f"the merged model cannot be read, and may be as it should be. To mend: {merged.problem}"
     if name == "merged":
         return f"the merged model is out of date: {merged.reason}. Merge again: vdgs merge {shell_word(folder.path)}"
     state = f"there is one that was {merged.reason}" if merged.state == "stale" else "there is none yet"
-    return f"this is the coarse model, not the merged one: {state}. {remedy}"
+    return f"this is the coarse model, not the merged one: {state}. {_next_text(run_status)}"
 
 
 def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:

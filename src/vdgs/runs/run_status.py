@@ -15,7 +15,7 @@ from typing import Literal
 from vdgs.errors import VdgsError
 from vdgs.partition.block_records import PartitionRecord
 from vdgs.runs.config_file import run_command
-from vdgs.runs.model_integrity import integrity_error, path_to_delete
+from vdgs.runs.model_integrity import integrity_error, path_to_delete, unreadable_text
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
@@ -57,7 +57,14 @@ class StageStatus:
     step: StepRecord | None = None
     """The progress of the step in which the stage is, or was stopped."""
     problem: str = ""
-    """Why its output cannot be read, which says nothing against it: a permission, a disk that is away."""
+    """Why its output cannot be read, which says nothing against it (a permission, a disk that is away), and what to
+    do."""
+
+    @property
+    def recorded_state(self) -> StageState:
+        """The state by its record alone, whether or not its output can be read now: what was made of that is judged by
+        this."""
+        return "done" if self.problem else self.state
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,7 @@ class RunStatus:
     @property
     def digest(self) -> str:
         """A digest of this status: a report of it is out of date once it differs."""
-        content = [[stage.name, stage.state, stage.output_id] for stage in self.stages]
+        content = [[stage.name, stage.recorded_state, stage.output_id] for stage in self.stages]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
     def next_command(self) -> str:
@@ -240,19 +247,19 @@ class _StatusScanner:
             hint = f"rm {shell_word(folder.status_file)} && "
             return StageStatus(name=name, state="unknown", folder=inside, reason=_first_line(str(error)), hint=hint)
         state, why = self._state_of(folder, status, key, other, locked)
+        output_id = status.model_id or ""
         try:
             wrong = integrity_error(folder, key or "", _number(name)) if state == "done" else ""
+            hint = f"rm -r {shell_word(path_to_delete(folder))} && " if wrong else ""
         except OSError as error:
-            reason = f"{folder.model.name} cannot be read ({error.strerror})"
-            problem = f"{folder.model}: {error.strerror}"
             return StageStatus(
-                name=name, state="unknown", folder=inside, reason=reason, status=status, problem=problem
+                name=name, state="unknown", folder=inside, status=status, output_id=output_id,
+                reason=f"{folder.model.name} cannot be read ({error.strerror})",
+                problem=unreadable_text(folder, error),
             )  # fmt: skip
         if wrong:
             reason = f"model.safetensors is {wrong}"
-            hint = f"rm -r {shell_word(path_to_delete(folder))} && "
             return StageStatus(name=name, state="stale", folder=inside, reason=reason, status=status, hint=hint)
-        output_id = status.model_id or ""
         return StageStatus(name=name, state=state, folder=inside, reason=why, status=status, output_id=output_id)
 
     def _state_of(
@@ -279,7 +286,9 @@ class _StatusScanner:
         found = self._trained("merge", merged, self._key("merge"), OTHER_SETTINGS, self.run.path)
         if found.state != "done" or found.status is None:
             return found
-        models = tuple((b.status.model_id if b.status else None) if b.state == "done" else None for b in blocks)
+        models = tuple(
+            (b.status.model_id if b.status else None) if b.recorded_state == "done" else None for b in blocks
+        )
         stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
         if found.status.block_models != models:
             return replace(found, state="stale", reason=OTHER_BLOCKS)
@@ -291,7 +300,7 @@ class _StatusScanner:
         record = read_json_or_empty(folder / "status.json")
         made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
         found = record.get("model")
-        known = model.output_id if model.state == "done" else ""
+        known = model.output_id if model.recorded_state == "done" else ""
         return self._judged(name, folder, there, found, known or None, made, OTHER_MODEL)
 
 

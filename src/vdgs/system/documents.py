@@ -110,6 +110,8 @@ class RunStatusDocument(TypedDict):
     complete: bool
     running: bool
     next_command: str | None
+    problem: str | None
+    """What to mend by hand before any command is of use."""
     stages: list[StageStatusDocument]
 
 
@@ -121,9 +123,11 @@ class ExportedFile(TypedDict):
     gaussians: int
     bytes: int
     seconds: float
-    #: The system of its coordinates, for people, and what the third counts from.
+    #: The system of its coordinates and where its axes go, for people, and what the third coordinate counts from; None
+    #: where that one does not go up.
     crs_name: str
-    heights: str
+    axes: str
+    heights: str | None
     #: What is to be known of that system, and what was lost.
     notes: list[str]
 

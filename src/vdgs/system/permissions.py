@@ -1,4 +1,4 @@
-"""Files and folders that a person may not read: which one is in the way, and what opens it."""
+"""Files and folders that the system does not let be read: which one is in the way, and what opens it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ def barred_by(path: Path) -> Path:
 
 
 def refusal(path: Path, error: OSError) -> str:
-    """What to say, behind its name, of a file or folder that the system does not let a person read."""
-    return f"cannot be read ({error.strerror or error}). Allow it: {how_to_allow(path)}"
+    """What to say, behind its name, of a file or folder that the system does not let be read, which says nothing of
+    what it holds: for want of a permission, or of a disk."""
+    remedy = f"Allow it: {how_to_allow(path)}" if isinstance(error, PermissionError) else "See to its disk"
+    return f"cannot be read ({error.strerror or error}). {remedy}"
 
 
 def how_to_allow(path: Path) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.axes import Y_DOWN, Y_UP, Z_UP, Axes
 from vdgs.export.formats.compressed_ply import compressed_ply_pieces, is_compressed, write_compressed_ply
 from vdgs.export.formats.export_scene import ExportScene, InitialView, concatenate, metadata_path
 from vdgs.export.formats.file_folders import FileFolder
@@ -46,6 +47,8 @@ class ExportFormat:
     #: What it is, in a few words.
     description: str
     write: Callable[[Path, ExportScene], tuple[str, ...]]
+    #: How its axes stand where no others are asked for.
+    axes: Axes = Z_UP
     #: Reads a file back into the ground frame, piece by piece, where that makes sense.
     read: Callable[[Path], Iterator[Gaussians]] | None = None
     #: Raises VdgsError for what can be known to fail before the first chunk is asked for.
@@ -102,6 +105,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".compressed.ply",
         description="PlayCanvas' compressed PLY, a quarter",
         write=write_compressed_ply,
+        axes=Y_DOWN,
         read=read_any_ply,
         facts_file=beside_ply,
     ),
@@ -116,6 +120,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".spz",
         description="SPZ, a sixth of the PLY or less",
         write=write_spz,
+        axes=Y_UP,
         read=read_spz_chunks,
         check=check_range,
         writes_metadata_file=True,
@@ -126,6 +131,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".splat",
         description="32 bytes a Gaussian, fixed colors",
         write=write_splat,
+        axes=Y_DOWN,
         read=read_splat_chunks,
         writes_metadata_file=True,
         facts_file=metadata_path,
@@ -134,6 +140,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".sog",
         description="PlayCanvas' SOG, a twelfth of the PLY or less",
         write=write_sog,
+        axes=Y_DOWN,
         writes_metadata_file=True,
         facts_file=metadata_path,
     ),
@@ -141,6 +148,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".rad",
         description="Spark's RAD, with levels",
         write=write_rad,
+        axes=Y_UP,
         writes_metadata_file=True,
         facts_file=metadata_path,
     ),
@@ -148,6 +156,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".glb",
         description="glTF with KHR_gaussian_splatting, nothing lost",
         write=write_glb,
+        axes=Y_UP,
         check=check_glb_size,
     ),
     ExportFormat(
@@ -162,6 +171,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=LOD_FILE,
         description="PlayCanvas' streamed SOG, in levels",
         write=write_streamed_sog,
+        axes=Y_DOWN,
         check=check_lod_folder,
         writes_metadata_file=True,
         facts_file=metadata_path,
