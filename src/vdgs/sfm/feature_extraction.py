@@ -74,10 +74,10 @@ def group_by_camera(photographs: Sequence[ImageMetadata]) -> list[CameraGroup]:
         key = (photo.camera, photo.size, focal, photo.camera_model, photo.face or photo.sensor)
         alike.setdefault(key, []).append(photo)
     groups: dict[tuple[object, ...], list[ImageMetadata]] = {}
-    for key, members in alike.items():
+    for shared, members in alike.items():
         lenses = lens_numbers([None if photo.lens else photo.focal_mm for photo in members])
         for photo, number in zip(members, lenses, strict=True):
-            groups.setdefault((*key, number), []).append(photo)
+            groups.setdefault((*shared, number), []).append(photo)
     kinds = []
     for members in groups.values():
         first = members[0]
