@@ -42,7 +42,19 @@ def test_pictures_that_are_cut_on_both_sides_are_left_out_where_they_are_few(tmp
 
 @pytest.mark.parametrize(
     "size",
-    [(160, 90), (120, 120), (80, 45), (60, 60), (80, 60), (200, 200), (320, 240), (120, 90), (112, 63), (108, 72)],
+    [
+        (160, 90),
+        (120, 120),
+        (80, 45),
+        (60, 60),
+        (80, 60),
+        (200, 200),
+        (320, 240),
+        (120, 90),
+        (112, 63),
+        (108, 72),
+        (128, 67),
+    ],
 )
 def test_modes_of_a_camera_are_used(tmp_path, size):
     """The whole width or height of the sensor, with half the pixels across, too, or larger; stills of the size of
@@ -84,6 +96,19 @@ def test_other_lenses_of_one_name_and_moment_are_no_cut_copies(tmp_path):
     for k, name in enumerate(names):
         write_photograph(tmp_path / "oblique" / name, pixels(50 + k, 160, 100), k, np.array([10.0 * k, 0, 40]))
     assert collect_images([tmp_path]).excluded == ()
+
+
+@pytest.mark.parametrize("kind", ["white", "16 bits"])
+def test_pictures_that_show_nothing_to_compare_are_no_cut_copies(tmp_path, kind):
+    """A burnt-out picture, and the measurements of another sensor under the name of one camera."""
+    for name in flight(tmp_path / "orig"):
+        with Image.open(tmp_path / "orig" / name) as image:
+            exif = image.getexif()
+        shown = (
+            np.full((100, 110, 3), 255, np.uint8) if kind == "white" else pixels(9, 110, 100)[..., 0] * np.uint16(90)
+        )
+        picture(tmp_path / "other" / Path(name).with_suffix(".tif"), shown, exif=exif)
+    assert not [each for each in collect_images([tmp_path]).excluded if "is cut from" in each.reason]
 
 
 def test_a_cut_copy_that_was_shrunk_and_brightened_is_left_out(tmp_path):

@@ -12,6 +12,7 @@ from PIL import Image
 from support.flights import write_photograph
 from support.small_flights import flight, picture, pixels, said
 from vdgs.sfm.feature_extraction import group_by_camera
+from vdgs.sfm.focal_length import lens_numbers
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import ImageList, collect_images
 from vdgs.sfm.preflight import make_preflight_report
@@ -37,6 +38,10 @@ def test_focal_lengths_part_cameras_also_where_the_sensor_is_unknown(tmp_path, s
     groups = group_by_camera(collect_images([tmp_path]).images)
     assert [len(group.images) for group in groups] == [6 // count] * count
     assert not any(group.has_focal_prior for group in groups)
+
+
+def test_a_few_photographs_of_another_focal_length_merge_no_lenses():
+    assert lens_numbers([24.0, 50.0] * 5 + [35.0, None]) == [0, 1] * 5 + [1, 0]
 
 
 @pytest.mark.parametrize("focals", [(4.15, 4.17), (3.6, 3.7, 3.9, 3.65, 3.8, 3.75), (24, 35, 24, 24, 24, 24)])

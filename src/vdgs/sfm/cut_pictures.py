@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Sequence
 
 from vdgs.sfm.focal_length import CUT
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
 #: Shapes of sensors and films: programs and cameras shrink pictures to them over the whole width.
-_SHAPES = (16 / 9, 3 / 2, 4 / 3)
+_SHAPES = (256 / 135, 16 / 9, 3 / 2, 4 / 3)
 #: Where more of a camera's photographs (share) would be left out, they may be of another mode of it (choice).
 _MOST = 1 / 3
 
@@ -19,7 +19,7 @@ def cut_pictures(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     camera, with the reason; none of a camera that has many of them, nor where tags say how they were cut."""
     cameras: dict[str, list[ImageMetadata]] = {}
     for photo in photographs:
-        if not (photo.is_bare or photo.is_panorama):
+        if not (photo.camera.startswith(UNKNOWN_CAMERA) or photo.is_bare or photo.is_panorama):
             cameras.setdefault(photo.camera, []).append(photo)
     found = dict[str, str]()
     for members in cameras.values():

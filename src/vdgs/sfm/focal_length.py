@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from bisect import bisect_right
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
+
+import numpy as np
 
 from vdgs.sfm.exif_gps import plain_text
 from vdgs.sfm.raw_crops import USUAL_SHAPES, RawCrop, read_raw_crop
@@ -366,14 +365,16 @@ def _used_width(model: str, width: float, height: float) -> float | None:
 
 def lens_numbers(focals_mm: Sequence[float | None]) -> list[int]:
     """Which of a camera's focal lengths in millimetres are of one lens, as numbers from 0: those that lie apart by
-    `OTHER_LENS` from all others, and are of `LEAST_OF_A_LENS` photographs each, are lenses of their own.
+    `OTHER_LENS` from all others, and are of `LEAST_OF_A_LENS` photographs, are those of lenses; others are of the next.
 
     A zoom that was turned from photograph to photograph, and a lens whose focal length follows the focus, are one.
     """
-    known = sorted({focal for focal in focals_mm if focal})
-    starts = [b for a, b in pairwise(known) if b > a * (1 + OTHER_LENS)]
-    numbers = [bisect_right(starts, focal) if focal else 0 for focal in focals_mm]
-    return numbers if min(Counter(numbers).values(), default=0) >= LEAST_OF_A_LENS else [0] * len(numbers)
+    known = np.log(sorted(focal for focal in focals_mm if focal))
+    groups = np.split(known, np.flatnonzero(np.diff(known) > math.log1p(OTHER_LENS)) + 1)
+    lenses = np.array([group.mean() for group in groups if len(group) >= LEAST_OF_A_LENS])
+    if len(lenses) < 2:
+        return [0] * len(focals_mm)
+    return [int(np.abs(lenses - math.log(focal)).argmin()) if focal else 0 for focal in focals_mm]
 
 
 def _by_sensor(focal_mm: float | None, sensor_mm: float | None) -> float | None:

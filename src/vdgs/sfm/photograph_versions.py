@@ -35,8 +35,8 @@ SAME_PICTURE, LOOKED_AT_PAIRS = 0.95, 3
 #: A picture that was cut from another is looked for in so small a one, in so many sizes, and found where gray values
 #: correlate so well (choice: every size is within a few per cent of one that is tried).
 _SEARCHED_PX, _SEARCHED_SIZES, _SAME_PART = 320, 24, 0.8
-#: Smaller parts are in any picture.
-_LEAST_PART_PX = 16
+#: Smaller parts are in any picture (choice).
+_LEAST_PART_PX = 40
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)
 
@@ -108,35 +108,35 @@ def _is_cut_from(photo: ImageMetadata, other: ImageMetadata) -> bool:
 def _shows_part_of(photo: ImageMetadata, whole: ImageMetadata) -> bool:
     """Whether a picture is somewhere in another, in any brightness and contrast: as large as there, or shrunk from as
     much as its whole width or height."""
-    frame, shown = _small_gray(whole, _SEARCHED_PX / max(whole.size)), _gray(photo)
+    frame, shown = _small_gray(whole), _small_gray(photo)
     if frame is None or shown is None:
         return False
-    least = max(frame.shape) / max(whole.size)
-    most = min(side / cut for side, cut in zip(frame.shape, shown.shape, strict=True))
-    for factor in np.geomspace(min(least, most), most, _SEARCHED_SIZES):
-        size = [max(1, int(side * factor)) for side in shown.shape[::-1]]
-        part = cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
-        if min(size) >= _LEAST_PART_PX and cv2.matchTemplate(frame, part, cv2.TM_CCOEFF_NORMED).max() >= _SAME_PART:
+    shape = np.array(shown.shape) / max(shown.shape)
+    most = float(np.min(np.array(frame.shape) / shape))  # pixels of the longer side
+    as_cut = max(photo.size) * max(frame.shape) / max(whole.size)
+    for longer in np.geomspace(min(as_cut, most), most, _SEARCHED_SIZES):
+        height, width = np.maximum(1, (shape * longer).astype(int)).tolist()
+        part = cv2.resize(shown, (width, height), interpolation=cv2.INTER_AREA)
+        if min(height, width) < _LEAST_PART_PX or part.std() < 1:  # a picture of one gray is in any other
+            continue
+        if cv2.matchTemplate(frame, part, cv2.TM_CCOEFF_NORMED).max() >= _SAME_PART:
             return True
     return False
 
 
-def _gray(photo: ImageMetadata) -> UInt8[np.ndarray, "h w"] | None:
-    """Gray values of an upright picture; None for one that Pillow does not read."""
+def _small_gray(photo: ImageMetadata) -> UInt8[np.ndarray, "h w"] | None:
+    """Gray values of a small upright picture; None for one that Pillow does not read, or that has not 8 bits a
+    sample."""
     try:
         with open_image(photo.path) as image:
-            return np.asarray(ImageOps.exif_transpose(image).convert("L"))
+            image.draft("L", (2 * _SEARCHED_PX, 2 * _SEARCHED_PX))
+            if image.mode.startswith(("I", "F")):
+                return None
+            upright = ImageOps.exif_transpose(image).convert("L")
+            upright.thumbnail((_SEARCHED_PX, _SEARCHED_PX), Image.Resampling.BOX)
+            return np.asarray(upright)
     except (OSError, SyntaxError, ValueError):
         return None
-
-
-def _small_gray(photo: ImageMetadata, factor: float) -> UInt8[np.ndarray, "h w"] | None:
-    """The same, shrunk by a factor below 1."""
-    gray = _gray(photo)
-    if gray is None or factor >= 1:
-        return gray
-    size = [max(1, round(side * factor)) for side in gray.shape[::-1]]
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
 
 def _are_of_a_rig(photo: ImageMetadata, other: ImageMetadata) -> bool:

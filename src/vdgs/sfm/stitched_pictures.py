@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 
 #: The longer side by the shorter one: longer than this are no photographs of drones' sensors (16:9 is 1.78; choice).
 _LONG_SHAPE = 2.2
@@ -21,7 +21,9 @@ def stitched(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     usual, found = _usual_sizes(photographs), dict[str, str]()
     for photo in photographs:
         size = usual[photo.camera]
-        if _shape(photo.size) < _LONG_SHAPE or _shape(size) >= _LONG_SHAPE or photo.is_panorama or photo.is_bare:
+        if _shape(photo.size) < _LONG_SHAPE or _shape(size) >= _LONG_SHAPE or photo.is_panorama:
+            continue
+        if photo.is_bare or photo.camera.startswith(UNKNOWN_CAMERA):  # of cameras that nothing tells apart
             continue
         named = _NAMED.search(PurePosixPath(photo.name).stem) is not None
         if named or max(photo.size) > max(size):

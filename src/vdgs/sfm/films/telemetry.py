@@ -23,8 +23,9 @@ MAX_GAP_S = 3.0
 #: Before the first record, after the last and at the ends of a longer gap these count for so many seconds: as far as
 #: firmwares' records are apart.
 MAX_OUTSIDE_S = 1.0
-#: Clocks that lose or gain more against the film (seconds) do not run as it does: whole seconds, cut off (choice).
-MAX_DRIFT_S = 2.0
+#: Clocks that lose or gain more against the film (seconds; share of its time) do not run as it does. Whole seconds are
+#: cut off (choice).
+MAX_DRIFT_S, MAX_DRIFT = 1.0, 0.05
 #: A number of a list; one that stands alone, whose comma is that of decimals; and one with its unit.
 _NUMBER = r"([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"
 _ALONE = r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)(?![.,]?\d)"
@@ -111,7 +112,7 @@ def _on_one_clock(records: Sequence[Telemetry]) -> tuple[Telemetry, ...]:
     if all(one < other for one, other in pairwise(moments)):
         return tuple(records)
     lasted, shown = (moments[-1] - moments[0]).total_seconds(), clocked[-1].seconds - clocked[0].seconds
-    if abs(lasted - shown) > MAX_DRIFT_S:
+    if abs(lasted - shown) > max(MAX_DRIFT_S, MAX_DRIFT * shown):
         return tuple(records)
     starts = sorted(moment - timedelta(seconds=record.seconds) for moment, record in zip(moments, clocked, strict=True))
     cut_off = timedelta(seconds=0 if any(moment.microsecond for moment in moments) else 0.5)  # what is, in the median
