@@ -365,7 +365,7 @@ def _used_width(model: str, width: float, height: float) -> float | None:
 
 def lens_numbers(focals_mm: Sequence[float | None]) -> list[int]:
     """Which of a camera's focal lengths in millimetres are of one lens, as numbers from 0: those that lie apart by
-    `OTHER_LENS` from all others, and are of `LEAST_OF_A_LENS` photographs, are those of lenses; others are of the next.
+    `OTHER_LENS` from all others, and are of `LEAST_OF_A_LENS` photographs, are lenses; others are of the nearest lens.
 
     A zoom that was turned from photograph to photograph, and a lens whose focal length follows the focus, are one.
     """
