@@ -201,9 +201,9 @@ def meters_outside(area: Any, latitude: float, longitude: float) -> float:
     """How far a place lies from the nearest one (nearly) in an area of use of PROJ, in metres; 0 inside."""
     if is_inside(area, latitude, longitude):
         return 0.0
-    north = min(max(latitude, area.south), area.north)
-    within = is_inside(area, north, longitude)
-    east = 0.0 if within else min(abs((longitude - edge + 180) % 360 - 180) for edge in (area.west, area.east))
-    one, other, apart = np.radians([latitude, north, east])
-    sines = np.sin((one - other) / 2) ** 2 + np.cos(one) * np.cos(other) * np.sin(apart / 2) ** 2
-    return float(2 * SEMI_MAJOR_M * np.arcsin(np.sqrt(min(sines, 1.0))))
+    import pyproj
+
+    north, east = min(max(latitude, area.south), area.north), longitude
+    if not is_inside(area, north, longitude):
+        east = min((area.west, area.east), key=lambda edge: abs((longitude - edge + 180) % 360 - 180))
+    return float(pyproj.Geod(ellps="WGS84").inv(longitude, latitude, east, north)[2])
