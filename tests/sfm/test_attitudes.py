@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.flown_models import flown_model
-from vdgs.sfm import georegistration
 from vdgs.sfm.attitude_tilt import tilt_of_attitudes, tilt_of_views
 from vdgs.sfm.image_metadata import attitude_from_gimbal
+from vdgs.sfm.up_direction import up_of
 
 TILT = np.radians([3.0, -2.0])
 
@@ -83,6 +83,6 @@ def test_altitudes_are_used_where_a_fifth_of_the_attitudes_is_wrong(pitch_deg):
     model, photographs = flown_model(places, rng)
     for k in (2, 7, 11, 16):
         photographs[k].attitude = attitude_from_gimbal(90.0, pitch_deg, 0.0)
-    up, notes = georegistration.up_of(model, photographs)
+    up, notes = up_of(model, photographs)
     assert np.degrees(np.arccos(up.direction[2])) < 1
     assert notes == ["4 of 20 recorded attitudes contradict the others, and are not used."]

@@ -22,7 +22,6 @@ from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import georeferencing, georegistration
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
-from vdgs.sfm.georegistration import tilt_from_attitudes
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images, is_image_folder
 from vdgs.sfm.image_metadata import (
@@ -35,6 +34,7 @@ from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
+from vdgs.sfm.up_direction import tilt_from_attitudes
 from vdgs.sfm.xmp import first_number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)

@@ -19,6 +19,7 @@ from vdgs.sfm.georeferencing import _refuse_upside_down
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
+from vdgs.sfm.up_direction import model_points, up_of
 
 
 def up_of_an_arc(recorded_pitch_deg: float) -> tuple[Up, list[str]]:
@@ -38,7 +39,7 @@ def up_of_an_arc(recorded_pitch_deg: float) -> tuple[Up, list[str]]:
         photographs.append(SimpleNamespace(name=str(k), attitude=recorded, face=""))
     wall = rng.uniform(-1, 1, (400, 3)) * [8, 8, 5] + [0, 0, 5]
     points = {k: SimpleNamespace(xyz=turn @ place) for k, place in enumerate(wall)}
-    up, notes = georegistration.up_of(SimpleNamespace(images=images, points3D=points), photographs)
+    up, notes = up_of(SimpleNamespace(images=images, points3D=points), photographs)
     return replace(up, direction=up.direction @ turn), notes
 
 
@@ -122,7 +123,7 @@ def flight_along_a_line(pitch_deg: float) -> tuple[SimpleNamespace, list[SimpleN
 def test_exchanged_positions_along_a_line_are_refused_though_up_is_in_doubt(pitch_deg):
     """Level at a wall or straight down is one for photographs of one heading: neither looks straight up."""
     model, photographs, positions = flight_along_a_line(pitch_deg)
-    assert not georegistration.up_of(model, photographs)[0].sure
+    assert not up_of(model, photographs)[0].sure
     placed = georegistration.georegister(model, photographs, positions)
     assert isinstance(placed, Georegistration)
     assert abs(placed.similarity.scale - 1) < 0.05
@@ -164,7 +165,7 @@ def test_a_world_placed_upside_down_is_refused_though_up_is_in_doubt(over):
     prepared = SimpleNamespace(
         request=SimpleNamespace(options=SfmOptions()), image_list=SimpleNamespace(images=photographs)
     )
-    ground = float(np.median(georegistration.model_points(model)[:, 2]))
+    ground = float(np.median(model_points(model)[:, 2]))
     placed = SimpleNamespace(method="GPS")
     if not over:
         return _refuse_upside_down(model, ground, placed, prepared)

@@ -9,10 +9,11 @@ import numpy as np
 from vdgs.captures.position_adjustment import Up
 from vdgs.geometry.similarity import Similarity, fit_similarity
 from vdgs.sfm.gcp_list import GcpObservation
-from vdgs.sfm.georegistration import Georegistration, model_points, transform_model
+from vdgs.sfm.georegistration import Georegistration, transform_model
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
+from vdgs.sfm.up_direction import model_points
 from vdgs.sfm.workspace import call_cancellable
 from vdgs.system.lazy_pycolmap import pycolmap
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -30,6 +31,8 @@ BLACK_AND_WHITE, NEAR_GRAY = 0.97, 24
 _FLAT = "that the receiver measured no altitude (GPSMeasureMode 2)"
 #: Sides of the small picture that tells a mask.
 _LOOKED_AT = (128, 128)
+#: What photographs say of the camera that took them: its name, its lens and the focal length in mm.
+_Camera: TypeAlias = tuple[str, Lens | None, float | None]
 
 
 def cross_checked(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
@@ -194,22 +197,42 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     reasons |= cut_pictures([photo for photo in photographs if photo.name not in reasons])
     tagged = [photo for photo in photographs if not photo.is_bare]
     bare = [photo for photo in photographs if photo.is_bare and photo.name not in reasons]
-    lent = dict[str, ImageMetadata]()
-    kinds = Counter((photo.size, photo.camera, photo.lens, photo.focal_mm) for photo in tagged)
-    for photo in bare:
-        alike = [(camera, lens, mm) for size, camera, lens, mm in kinds if size == photo.size]
-        if len(bare) > len(tagged):
-            if len(alike) == 1 and alike[0][1] is not None:
-                lent[photo.name] = replace(photo, doubts=(*photo.doubts, _may_be_by(alike[0][0])))
-        elif not alike and len(bare) < len(tagged) and photo.lat_lon is None:
+    cameras = dict[tuple[int, int], dict[_Camera, None]]()
+    for photo in tagged:
+        cameras.setdefault(photo.size, {})[photo.camera, photo.lens, photo.focal_mm] = None
+    of_size = [(photo, list(cameras.get(photo.size, ()))) for photo in bare]
+    if len(bare) > len(tagged):
+        return reasons, _with_doubts(of_size)
+    untaken, lent = _with_lent_cameras(of_size, len(bare) < len(tagged))
+    return reasons | untaken, lent
+
+
+def _with_doubts(bare: Sequence[tuple[ImageMetadata, Sequence[_Camera]]]) -> dict[str, ImageMetadata]:
+    """Of pictures without tags, each with the cameras of tagged ones of its size: those that one camera with a known
+    lens may have taken, which say so."""
+    return {
+        photo.name: replace(photo, doubts=(*photo.doubts, _may_be_by(cameras[0][0])))
+        for photo, cameras in bare
+        if len(cameras) == 1 and cameras[0][1] is not None
+    }
+
+
+def _with_lent_cameras(
+    bare: Sequence[tuple[ImageMetadata, Sequence[_Camera]]], most_are_tagged: bool
+) -> tuple[dict[str, str], dict[str, ImageMetadata]]:
+    """Of pictures without tags, each with the cameras of tagged ones of its size: those that are no photographs, with
+    the reason, and the others with that camera where it is one."""
+    reasons, lent = dict[str, str](), dict[str, ImageMetadata]()
+    for photo, cameras in bare:
+        if not cameras and most_are_tagged and photo.lat_lon is None:
             reasons[photo.name] = (
                 f"has no tags of a camera, and {photo.width} x {photo.height} pixels, unlike the photographs: no "
                 "photograph of this flight? (Give it their tags if it is one.)"
             )
-        elif alike and is_black_and_white(photo):
+        elif cameras and is_black_and_white(photo):
             reasons[photo.name] = "is black and white and has no tags of a camera: a mask? Name it like its photograph"
-        elif len(alike) == 1:
-            camera, lens, focal_mm = alike[0]
+        elif len(cameras) == 1:
+            camera, lens, focal_mm = cameras[0]
             doubt = f"no tags of a camera; taken as by {camera}, as the others of its size"
             lent[photo.name] = replace(
                 photo, camera=camera, lens=lens, focal_mm=focal_mm, doubts=(*photo.doubts, doubt)

@@ -23,6 +23,7 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
+from vdgs.sfm.up_direction import model_points, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 
 WITHOUT = (
@@ -81,7 +82,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
         survey = gcp_adjustment.measure_gcps(
             model, control, prepared.origin, doubtful, _knows_altitude(prepared, placed)
         )
-    ground = float(np.median(georegistration.model_points(model)[:, 2]))
+    ground = float(np.median(model_points(model)[:, 2]))
     _refuse_upside_down(model, ground, placed, prepared)
     georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
     latitude, longitude, altitude = prepared.origin
@@ -125,7 +126,7 @@ def _by_distance(
 ) -> Georegistration:
     """Metres and up alone."""
     assert prepared.scale_bars is not None
-    up, notes = georegistration.up_of(model, prepared.image_list.images)
+    up, notes = up_of(model, prepared.image_list.images)
     factor, share = scale
     rotation = rotation_to_z(up.direction)
     centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
@@ -179,7 +180,7 @@ def _bent(
     bent = bend_to_positions(model, photographs, positions, placed, hold_focal, prepared.threads)
     if bent is model:
         return model, placed
-    up, _ = georegistration.up_of(model, photographs)
+    up, _ = up_of(model, photographs)
     anew = _by_positions(bent, prepared) if tell_level(placed, up) else None
     if isinstance(anew, Georegistration) and anew.is_georeferenced:
         georegistration.transform_model(bent, anew.similarity)
@@ -238,9 +239,9 @@ class Doubts:
             by_gps = AlignmentFailure("", "")
         centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
         return cls(
-            up=georegistration.up_of(model, photographs)[0],
+            up=up_of(model, photographs)[0],
             centers=centers,
-            ground=georegistration.model_points(model),
+            ground=model_points(model),
             by_gps=by_gps if isinstance(by_gps, Georegistration) else None,
             gps=positions.source,
             recorded_height_m=prepared.preflight.height_m,
@@ -338,7 +339,7 @@ def _refuse_upside_down(
         return
     images = [image for image in model.images.values() if image.has_pose]
     height = float(np.median([image.projection_center()[2] for image in images])) - ground
-    up, _ = georegistration.up_of(model, prepared.image_list.images)
+    up, _ = up_of(model, prepared.image_list.images)
     views = np.array([image.cam_from_world().rotation.matrix() for image in images])
     is_doubted = not up.sure and height < 0 and are_turned_over(views)
     if up.direction[2] < 0 and (up.sure or is_doubted):

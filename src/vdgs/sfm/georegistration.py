@@ -9,37 +9,22 @@ import numpy as np
 
 from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up
+from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem
 from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
-from vdgs.captures.up_axis import up_by_views
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
-from vdgs.geometry.similarity import Similarity, geometric_median, is_collinear, rotation_to_z
-from vdgs.sfm.attitude_tilt import are_turned_over, tilt_of_attitudes
+from vdgs.geometry.similarity import Similarity, is_collinear
+from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.recorded_headings import checked_by_headings
+from vdgs.sfm.up_direction import camera_rotation, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
 
-#: Attitudes that agree on which way a world lies, at least.
-MIN_ATTITUDES = 3
-#: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, and by so
-#: many standard deviations of it, are no measurements (choice).
-SCATTER_DEG, CONTRADICT_DEG, CONTRADICT_SIGMAS = 20.0, 45.0, 3.0
-#: So large a share of recorded attitudes that contradict the others is told (choice).
-WRONG_ATTITUDES = 0.1
-#: What errors about up and about mirror images ask where it is from attitudes, and is down by the views.
-LOOKED_UP = (
-    " Or are the recorded attitudes wrong, by which the cameras looked up (a pitch of +90° where straight down "
-    "is -90°)?"
-)
-#: How far a camera may hang beside what is recorded, in degrees: flown in several directions, where that cancels, and
-#: where all look one way (choice).
-HANGS_DEG, HANGS_ALIKE_DEG = 1.0, 2.5
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
@@ -110,8 +95,7 @@ def georegister(
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
     up, notes = up_of(model, images_metadata)
     taken = [images_metadata[int(positions.image_indices[row])] for row in rows]
-    said = positions.are_stated[rows] if len(positions.are_stated) and not stated else np.full(len(rows), stated)
-    deviations = with_unstated(positions.gps_std[rows], said)
+    deviations, are_known = _deviations(positions, rows, stated)
     problem = Problem(
         centers=centers,
         targets=targets,
@@ -119,16 +103,14 @@ def georegister(
         flights=positions.flights[rows] if len(positions.flights) == len(positions) else None,
         up=up,
         scale=scale,
-        stated=deviations if are_told(deviations, said) else None,
+        stated=deviations if are_known else None,
         relative=relative_deviations(deviations),
         has_altitudes=positions.has_altitudes,
     )
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
     fit, barometer, over_ground = _best_fit(levelled, taken)
-    views, wrong = np.array([_rotation(image) for image in images.values()]) @ fit.similarity.rotation.T, ""
-    if up.sure or are_turned_over(views):
-        wrong = mirrored(centers, targets, up.direction, _other_readings(targets, positions.origin))
+    wrong = _mirrored(fit, problem, images, positions)
     if wrong and not anyway:
         raise CaptureError(
             f"the positions ({positions.source}) fit the photographs only once {wrong}: as they are, the world would "
@@ -150,14 +132,13 @@ def georegister(
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
     notes += [f"{refused}; used all the same, as asked for."] if refused else []
     notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
-    how = _method(fit, barometer, on_a_line, positions.source, up.how)
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
     notes += of_reading + of_line + of_north + list(filter(None, [weighing_note(fit.deviations, fit.inliers)]))
     return Georegistration(
         similarity=fit.similarity,
-        method=how,
+        method=_method(fit, barometer, on_a_line, positions.source, up.how),
         position_rows=rows,
         targets=fit.placed - fit.residuals,
         residuals=_recorded(fit.placed - levelled.targets, positions),
@@ -166,6 +147,22 @@ def georegister(
         accuracy=accuracy_of(fit, positions, offsets),
         notes=tuple(notes),
     )
+
+
+def _deviations(positions: GpsPriors, rows: np.ndarray, stated: bool) -> tuple[np.ndarray, bool]:
+    """What each of the positions in `rows` [m] is said to be good for [m, 3], and whether enough of them say so."""
+    said = positions.are_stated[rows] if len(positions.are_stated) and not stated else np.full(len(rows), stated)
+    deviations = with_unstated(positions.gps_std[rows], said)
+    return deviations, are_told(deviations, said)
+
+
+def _mirrored(fit: PositionFit, problem: Problem, images: Mapping[str, pycolmap.Image], positions: GpsPriors) -> str:
+    """Which other reading of the positions alone fits the photographs (`plane_fit.mirrored`); "" where they fit."""
+    views = np.array([camera_rotation(image) for image in images.values()]) @ fit.similarity.rotation.T
+    if not problem.up.sure and not are_turned_over(views):
+        return ""
+    readings = _other_readings(problem.targets, positions.origin)
+    return mirrored(problem.centers, problem.targets, problem.up.direction, readings)
 
 
 def _method(fit: PositionFit, barometer: bool, on_a_line: bool, source: str, up: str) -> str:
@@ -379,37 +376,6 @@ def _moments(taken: Sequence[ImageMetadata]) -> np.ndarray:
     return moments
 
 
-def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) -> tuple[Up, list[str]]:
-    """What attitudes that the drone recorded, or else the views, say of up in the model's world; and notes."""
-    poles = {photo.name for photo in photographs if photo.face in ("up", "down")}  # of panoramas, which are upright
-    images = {image.name: image for image in model.images.values() if image.has_pose and image.name not in poles}
-    rotations = np.array([_rotation(image) for image in images.values()])
-    centers = np.array([image.projection_center() for image in images.values()])
-    direction, deviation, sure = up_by_views(centers, rotations, model_points(model))
-    views = Up(direction, deviation, "the views", sure)
-    seen = [photo for photo in photographs if photo.attitude is not None and photo.name in images]
-    if len(seen) < max(MIN_ATTITUDES, len(images) / 2):
-        return views, []
-    rotations = np.array([_rotation(images[photo.name]) for photo in seen])
-    down = np.array([photo.attitude.gravity for photo in seen if photo.attitude is not None])
-    ups = -np.einsum("nji,nj->ni", rotations, down)
-    middle = geometric_median(ups)  # some may be wrong
-    mean = middle / max(float(np.linalg.norm(middle)), 1e-12)
-    scatter = float(np.median(np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))))
-    apart = float(np.degrees(np.arccos(np.clip(mean @ direction, -1, 1))))
-    level = rotation_to_z(mean)
-    tilt, several, agree = tilt_of_attitudes(rotations @ level.T, down)
-    most = max(CONTRADICT_DEG, CONTRADICT_SIGMAS * views.deviation_deg)
-    if scatter > SCATTER_DEG or (sure and not several and apart > most):
-        return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
-    found = level.T @ np.append(-tilt, 1.0)
-    deviation = float(np.hypot(scatter / np.sqrt(len(seen)), HANGS_DEG if several else HANGS_ALIKE_DEG))
-    doubt, wrong = LOOKED_UP if apart > 90 else "", int((~agree).sum())
-    many = wrong >= WRONG_ATTITUDES * len(seen)
-    notes = [f"{wrong} of {len(seen)} recorded attitudes contradict the others, and are not used."] if many else []
-    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes", doubt=doubt), notes
-
-
 def registration_in_place(
     model: pycolmap.Reconstruction,
     photographs: Sequence[ImageMetadata],
@@ -448,27 +414,6 @@ def transform_model(model: pycolmap.Reconstruction, similarity: Similarity) -> N
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
 
 
-def model_points(model: pycolmap.Reconstruction) -> np.ndarray:
-    """Places of all points, [n, 3]."""
-    return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-
-
-def tilt_from_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) -> float | None:
-    """Angle in degrees between down as the placed model has it and as the drone recorded it.
-
-    Recorded down in the camera is down of the model, turned by a tilt of the world and by how the camera hangs on the
-    drone, which is the same in all photographs. Flown in several directions the two are told apart, by least squares
-    for small angles; in one, all is taken for a tilt.
-    """
-    gravity = {photo.name: photo.attitude.gravity for photo in photographs if photo.attitude}
-    images = [image for image in model.images.values() if image.has_pose and image.name in gravity]
-    if len(images) < MIN_ATTITUDES:
-        return None
-    rotations = np.array([_rotation(image) for image in images])
-    tilt, _, _ = tilt_of_attitudes(rotations, np.array([gravity[image.name] for image in images]))
-    return float(np.degrees(np.linalg.norm(tilt)))
-
-
 def _match_positions(
     images: Mapping[str, pycolmap.Image], photographs: Sequence[ImageMetadata], positions: GpsPriors
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -477,7 +422,3 @@ def _match_positions(
     names = [photographs[int(positions.image_indices[row])].name for row in rows]
     centers = np.array([images[name].projection_center() for name in names]).reshape(-1, 3)
     return rows, centers, positions.enu[rows]
-
-
-def _rotation(image: pycolmap.Image) -> np.ndarray:
-    return np.asarray(image.cam_from_world().rotation.matrix())

@@ -108,16 +108,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     recorded = _read_geodetic(photographs, table)
     geodetic, notes = recorded.geodetic, recorded.notes
     names = [photo.name for photo in photographs]
-    known = np.isfinite(geodetic[:, :2]).all(axis=1)
-    nowhere = known & are_nowhere(geodetic)
-    if nowhere.any():
-        notes.append(f"{_some(names, nowhere)}: the position is 0, 0 (no satellites yet); not used.")
-    known &= ~nowhere
-    if known.any():
-        far = known & are_far_off(geodetic, known)
-        if far.any():
-            notes.append(f"{_some(names, far)}: the position is far from all others; not used.")
-        known &= ~far
+    known = _of_one_place(geodetic, names, notes)
     geodetic, kept, has_altitudes = _in_space_or_plane(geodetic, known, names, notes)
     index = np.flatnonzero(kept)
     origin = _origin(geodetic[index])
@@ -137,13 +128,11 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     if step:
         notes.append(f"altitudes are all multiples of {step:.4g} m: rounded; that counts as their error.")
         deviations[:, 2] = np.hypot(deviations[:, 2], ROUNDING_ERROR * step)
-    kinds = [ALTITUDE_UNKNOWN]
-    if has_altitudes:
-        kinds = list(dict.fromkeys(recorded.kinds[i] for i in index.tolist()))
+    of_each = [recorded.kinds[i] for i in index.tolist()]
+    kinds = list(dict.fromkeys(of_each)) if has_altitudes else [ALTITUDE_UNKNOWN]
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     taken, heights = [photographs[i] for i in index.tolist()], None if step >= STEP_M else enu[:, 2]
-    flights = flights_of(taken, [recorded.kinds[i] for i in index.tolist()], heights)
     return GpsPriors(
         image_indices=index,
         enu=enu,
@@ -154,10 +143,25 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         source=recorded.source,
         notes=tuple(notes),
         has_altitudes=has_altitudes,
-        flights=flights,
+        flights=flights_of(taken, of_each, heights),
         altitude_step_m=step,
         datum_errors_m=np.array([photo.datum_error_m if table is None else recorded.datum_error_m for photo in taken]),
     )
+
+
+def _of_one_place(geodetic: np.ndarray, names: Sequence[str], notes: list[str]) -> np.ndarray:
+    """Which of the positions [n, 3] are known [n] bool, but for those at 0, 0 and far from all others; notes say so."""
+    known = np.isfinite(geodetic[:, :2]).all(axis=1)
+    nowhere = known & are_nowhere(geodetic)
+    if nowhere.any():
+        notes.append(f"{_some(names, nowhere)}: the position is 0, 0 (no satellites yet); not used.")
+    known &= ~nowhere
+    if not known.any():
+        return known
+    far = known & are_far_off(geodetic, known)
+    if far.any():
+        notes.append(f"{_some(names, far)}: the position is far from all others; not used.")
+    return known & ~far
 
 
 def _of_places_apart(enu: np.ndarray) -> list[str]:

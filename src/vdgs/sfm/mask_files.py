@@ -60,22 +60,21 @@ def find_masks(folders: Sequence[Path], files: Collection[Path]) -> tuple[dict[P
             within[(parent / inner).with_suffix("")].add(folder)
     beside = {place.parent: place for place in places.values()}
     is_folder = cache(Path.is_dir)
-    found = dict[Path, Path | None]()
-    for file in photographs:
-        if file in adjacent:
-            continue
-        found[file] = None
+    found: dict[Path, Path | None] = dict.fromkeys(file for file in photographs if file not in adjacent)
+    for file in found:
         for parent, name in _mask_candidates(file, folders, within):
             if parent not in beside:
-                beside[parent] = next(
-                    (parent / each for each in MASK_FOLDERS if is_folder(parent / each)), parent / MASK_FOLDER
-                )
+                beside[parent] = _mask_folder(parent)
             if found[file] is None and is_folder(beside[parent]):
                 found[file] = find_mask(beside[parent], name)
     for mask, photograph in adjacent.items():
         found[photograph] = found[photograph] or mask
-    there = sorted(place for place in beside.values() if is_folder(place))
-    return found, _mask_notes(there, found)
+    return found, _mask_notes(sorted(filter(is_folder, beside.values())), found)
+
+
+def _mask_folder(parent: Path) -> Path:
+    """The folder of masks in a folder by any of its names."""
+    return next((parent / name for name in MASK_FOLDERS if (parent / name).is_dir()), parent / MASK_FOLDER)
 
 
 def _beside_photographs(files: Sequence[Path]) -> dict[Path, Path]:

@@ -32,7 +32,6 @@ from vdgs.sfm import (
     capture_writer,
     feature_extraction,
     feature_matching,
-    georegistration,
     global_mapper,
     incremental_mapper,
     mask_files,
@@ -62,6 +61,7 @@ from vdgs.sfm.reconstruction_report import (
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
 from vdgs.sfm.source_images import SourceImages, check_unchanged
 from vdgs.sfm.step_keys import step_keys
+from vdgs.sfm.up_direction import model_points
 from vdgs.sfm.workspace import Workspace, report_progress, silence_colmap
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.file_locks import lock_folder
@@ -293,9 +293,7 @@ def _finish(prepared: ReconstructionPlan, outcome: ReconstructionResult, key: st
     shutil.rmtree(output / "sparse", ignore_errors=True)
     (output / "georef.json").unlink(missing_ok=True)
     marks = dict(zip((each.name for each in outcome.found.survey), _gcp_positions(prepared), strict=False))
-    plot_residuals(
-        georegistration.model_points(model), prepared.gps_priors, outcome.metric, marks, output / RECONSTRUCTION_FIGURE
-    )
+    plot_residuals(model_points(model), prepared.gps_priors, outcome.metric, marks, output / RECONSTRUCTION_FIGURE)
     if outcome.metric is not None:
         write_json(output / "georef.json", _georef(facts, outcome.found.origin))
     size = request.options.max_output_size

@@ -17,7 +17,7 @@ from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
 from vdgs.sfm.georeferencing import Georeferenced
-from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, model_points, tilt_from_attitudes
+from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -25,6 +25,7 @@ from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
 from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import mean_reprojection_error
+from vdgs.sfm.up_direction import model_points, tilt_from_attitudes
 from vdgs.system.lazy_pycolmap import pycolmap
 
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.

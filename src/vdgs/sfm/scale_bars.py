@@ -10,8 +10,8 @@ import numpy as np
 from vdgs.captures.known_distances import LocatedPoint, check_marked, read_known_distances, scale_of_distances
 from vdgs.sfm.gcp_adjustment import triangulate
 from vdgs.sfm.gcp_list import GcpObservation, GroundControlPoint, find_photograph, find_sighting, photographs_by_name
-from vdgs.sfm.georegistration import model_points
 from vdgs.sfm.image_list import ImageList
+from vdgs.sfm.up_direction import model_points
 from vdgs.system.lazy_pycolmap import pycolmap
 
 #: The distance from a camera to what it sees is the median of those to so many points at most: thousands of photographs

@@ -57,17 +57,9 @@ def read(file: Path, options: CaptureOptions) -> Project:
         raise CaptureError(f"{file}: FixedK must be followed by fx, cx, fy, cy and the distortion. {_AGAIN}")
     names = [name for name, *_ in cameras]
     views, refused = list[ProjectView](), dict[str, list[str]]()
-    for index, (size, camera) in enumerate(
-        zip(photograph_sizes(file.parent, options, names, file), cameras, strict=True)
-    ):
-        name, focal, radial, pose = camera
-        center, focals = (size[0] / 2, size[1] / 2), (focal, focal)
-        if shared:  # some writers count the principal point from the corner
-            focals, radial = (shared[0], shared[2]), (*shared, 0.0)[4]
-            middle = [0.0 if abs(c) > 0.25 * side else side / 2 for c, side in zip(shared[1::2], size, strict=True)]
-            center = (shared[1] + middle[0], shared[3] + middle[1])
-            check_centered(center, size, file, name, GIVE_ALIGNED)
-        lens = _lens(focals, center, size, radial, file, name)
+    sizes = photograph_sizes(file.parent, options, names, file)
+    for index, (size, (name, focal, radial, pose)) in enumerate(zip(sizes, cameras, strict=True)):
+        center, lens = _calibration(focal, radial, shared, size, file, name)
         if isinstance(lens, str):
             refused.setdefault(lens, []).append(name)
             continue
@@ -86,6 +78,20 @@ def read(file: Path, options: CaptureOptions) -> Project:
         format="visualsfm", file=file, views=tuple(views), points=points, colors=colors, warnings=note,
         refused=refused, remedy="Undistort the photographs, and reconstruct from those",
     )  # fmt: skip
+
+
+def _calibration(
+    focal: float, radial: float, shared: list[float], size: tuple[int, int], file: Path, name: str
+) -> tuple[tuple[float, float], Intrinsics | str]:
+    """The principal point of a camera, and its lens or why there is none; `shared` is what FixedK says of all."""
+    if not shared:
+        center = (size[0] / 2, size[1] / 2)
+        return center, _lens((focal, focal), center, size, radial, file, name)
+    # Some writers count the principal point from the corner.
+    middle = [0.0 if abs(c) > 0.25 * side else side / 2 for c, side in zip(shared[1::2], size, strict=True)]
+    center = (shared[1] + middle[0], shared[3] + middle[1])
+    check_centered(center, size, file, name, GIVE_ALIGNED)
+    return center, _lens((shared[0], shared[2]), center, size, (*shared, 0.0)[4], file, name)
 
 
 def _count(lines: list[str], at: int, file: Path) -> int:
