@@ -444,7 +444,7 @@ def test_views_that_look_down_tell_up_over_a_slope():
         [np.diag([1.0, -1, -1]) @ Rotation.from_euler("xyz", [*rng.normal(0, 3, 2), 180.0 * (k % 2)], True).as_matrix()
          for k in range(len(places))]
     )  # fmt: skip
-    up, deviation, sure = up_by_views(places + slope[:, None] * [0, 0, 1], rotations, ground)
+    up, deviation, sure, _ = up_by_views(places + slope[:, None] * [0, 0, 1], rotations, ground)
     assert np.degrees(np.arccos(up[2])) < 6
     assert sure
     assert deviation >= 3

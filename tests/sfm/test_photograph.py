@@ -477,6 +477,13 @@ def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
     where = positions_of(seen)
     held = [should_fix_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
     assert held == [True, False, False, False]
+    strips = flight(tmp_path, 12)
+    north_m = np.array([photo.lat_lon[0] for photo in strips]) * 111_000
+    slope = [
+        replace(photo, relative_altitude=40.0 + abs(m - north_m[0])) for photo, m in zip(strips, north_m, strict=True)
+    ]
+    assert np.ptp(north_m) > 30
+    assert should_fix_focal(slope, where, SfmOptions())[1].startswith("flown at one height over a slope")
     assert should_fix_focal(oblique, where, SfmOptions(focal="fixed"))[0]
 
 

@@ -32,11 +32,11 @@ from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.odd_positions import MIN_SPREAD_M, do_not_spread
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, Up
-from vdgs.captures.position_fit import fit_positions
+from vdgs.captures.position_fit import fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import by_axis
 from vdgs.captures.tables_beside import position_tables, table_note
-from vdgs.captures.up_axis import estimate_up, up_by_views
+from vdgs.captures.up_axis import HINT, estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
@@ -243,9 +243,9 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             "scale nor north; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    direction, deviation, sure = up_by_views(scene.centers, scene.rotations, scene.points)
+    views = up_by_views(scene.centers, scene.rotations, scene.points)
     times = _taken_in_order([scene.names[i] for i in indices])
-    up = Up(direction, deviation, "the views", sure)
+    up = Up(views.direction, views.deviation_deg, "the views", views.sure, other=views.other)
     said = np.isfinite(positions.deviations).all(axis=1)
     usual = [USUAL_M[0], *USUAL_M]
     deviations = with_unstated(np.where(said[:, None], positions.deviations, usual), said)
@@ -254,11 +254,14 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         stated=deviations if are_told(deviations, said) else None, relative=relative_deviations(deviations),
     )  # fmt: skip
     image = enu * [-1.0, 1.0, 1.0]  # of which exchanged axes are a turn
-    if sure and mirrored(centers, enu, direction, {"the mirror image": image}):
+    if up.sure and mirrored(centers, enu, up.direction, {"the mirror image": image}):
         raise CaptureError(
             f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
             "minus sign of south or west missing? Mend the table, or leave --gps out."
         )
+    problem, doubt = with_likelier_up(problem)
+    if doubt:
+        warnings.append(f"{file.name}: {doubt}. If that is wrong, leave --gps out, and {HINT}")
     fit = _fit_table(problem, geodetic[:, 2], file, warnings)
     refused = fit.why_refused(file.name)
     if refused:

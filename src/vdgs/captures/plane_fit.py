@@ -16,19 +16,22 @@ LEAST_M = 0.01
 MOST_PAIRS, MOST_PLACES = 1000, 500
 #: A mirror image explains positions better if the log likelihood is so much larger and the residuals so much smaller.
 MIRRORED_BY, MIRRORED_TIMES = 10.0, 0.7
+#: Cameras that spread across a line by less than so many residuals do not tell (choice).
+ACROSS_TIMES = 2.0
 
 
 def mirrored(centers: np.ndarray, targets: np.ndarray, up: np.ndarray, others: dict[str, np.ndarray]) -> str:
     """Which of other readings of positions `targets` [n, 3], by what they are called, explains camera centers [n, 3],
-    whose up [3] is known for sure, far better than the positions as they are; empty where none does."""
+    whose up [3] is known for sure, far better than the positions as they are; empty where none does, or where cameras
+    along one line, which is its own mirror image, cannot tell."""
     if len(centers) < 3:
         return ""
     source, best, name = in_plane(centers @ rotation_to_z(up).T), 1.0, ""
-    plain = _spread_left(source, in_plane(targets))
+    plain, _ = _spread_left(source, in_plane(targets))
     for each, changed in others.items():
-        ratio = _spread_left(source, in_plane(changed)) / plain
-        if ratio < best:
-            best, name = ratio, each
+        left, is_line = _spread_left(source, in_plane(changed))
+        if left / plain < best and not is_line:
+            best, name = left / plain, each
     more = 2 * len(source) * math.log(1 / max(best, 1e-9))
     return name if best < MIRRORED_TIMES and more > MIRRORED_BY else ""
 
@@ -37,12 +40,16 @@ def in_plane(places: np.ndarray) -> np.ndarray:
     return places[:, 0] + 1j * places[:, 1]
 
 
-def _spread_left(source: np.ndarray, target: np.ndarray) -> float:
-    """What the best similarity in the plane leaves, as a share of how far the positions spread."""
+def _spread_left(source: np.ndarray, target: np.ndarray) -> tuple[float, bool]:
+    """What the best similarity in the plane leaves, as a share of how far the positions spread; and whether places
+    spread across a line by no more than that."""
     factor, shift = fit_plane(source, target)
     off = np.abs(factor * source + shift - target)
     middle = target - np.median(target.real) - 1j * np.median(target.imag)
-    return float(max(_typical(off), LEAST_M) / max(_typical(np.abs(middle)), LEAST_M))
+    left = max(_typical(off), LEAST_M)
+    around = factor * (source - source.mean())
+    across = np.linalg.svd(np.stack([around.real, around.imag]), compute_uv=False)[1] / math.sqrt(len(source))
+    return left / max(_typical(np.abs(middle)), LEAST_M), bool(across <= ACROSS_TIMES * left)
 
 
 def _typical(off: np.ndarray) -> float:

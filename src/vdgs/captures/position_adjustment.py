@@ -13,6 +13,7 @@ from scipy.special import chdtri, fdtri, stdtrit
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
 from vdgs.captures.position_weights import agreed, as_many, of_alike, typical
+from vdgs.captures.up_axis import OtherUp
 from vdgs.geometry.similarity import Similarity, rotation_about
 
 #: From so many on, east and north have a standard deviation each; of fewer they share one.
@@ -56,6 +57,7 @@ class Up:
     """Whether up may be taken for down by mistake: no."""
     doubt: str = ""
     """What else says that it is down, for errors: a sentence behind a blank, or empty."""
+    other: OtherUp | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

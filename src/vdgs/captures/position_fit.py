@@ -26,6 +26,28 @@ HELD_DEG, BOTH_WITHIN = 1e-3, 2.45
 #: Positions of a flight at about one height tell up where it would be off by so many times more without them: heights
 #: differ by less than this share of how far cameras spread (choice).
 TELL_BETTER, ONE_HEIGHT = 1.5, 0.15
+#: Altitudes drift by no more in a flight, in metres (choice): a fit with more is one of positions that do not spread.
+MOST_DRIFT_M = 300.0
+#: The other way that photographs may have been taken must explain positions better by so much (log likelihood; choice).
+OTHER_COSTS = 4.0
+#: And its up must be that of the fit by this cosine (choice).
+OTHER_COSINE = 0.7
+#: How up is found where it does.
+OTHER_VIEW = "the views and the positions"
+
+
+def with_likelier_up(problem: Problem) -> tuple[Problem, str]:
+    """The problem with that of two ups which the positions fit better; and, where neither is better by more than
+    `OTHER_COSTS`, what is in doubt."""
+    other = problem.up.other
+    if other is None:
+        return problem, ""
+    turned = replace(problem, up=replace(problem.up, direction=other.direction, how=OTHER_VIEW))
+    fit, usual = fit_positions(turned), fit_positions(problem)
+    if abs(fit.score - usual.score) <= OTHER_COSTS:
+        return problem, f"{other.doubt}, for the positions do not tell"
+    is_upright = fit.similarity.rotation[2] @ other.direction > OTHER_COSINE  # else neither is up: are they mirrored?
+    return (turned if fit.score < usual.score and is_upright else problem), ""
 
 
 def fit_positions(problem: Problem) -> PositionFit:
@@ -42,6 +64,7 @@ def fit_positions(problem: Problem) -> PositionFit:
     if problem.has_altitudes and len(problem.centers) >= ENOUGH_TO_DOUBT:
         models.append("drifts")
     found = [settle(problem, start, model) for start in starts for model in models]
+    found = [fit for fit in found if abs(fit.drift_m) <= MOST_DRIFT_M]
     plane = _settle_in_plane(problem)
     best = min([plane, *found], key=lambda fit: fit.score)
     if best.altitude == "used" and _says_less_than_views(best, problem):

@@ -4,7 +4,8 @@ Flights look down on what is flat: up is the axis of least variance, against the
 level. At a wall the flat thing is the wall; in a street the cameras are below the median point. But whoever holds a
 camera level has horizontal right vectors and image-ups that agree, and these say what up is. A wall taken from
 straight in front by parallel views cannot be told from a flight of one heading that looks straight down (the two are
-congruent): it is taken for the flight, with a warning.
+congruent): it is taken for the flight, with a warning. Nor can a steep slope, straight below cameras of one heading,
+be told from a ceiling. Positions may tell both (`position_fit.with_likelier_up`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ MIN_VIEW_COSINE = 0.1
 MIN_UP_AGREEMENT = 0.9
 #: From this cosine between up and the mean image-up that says which way up is, where the view says it less (choice).
 MIN_UPRIGHT_COSINE = 0.5
+#: From this product of the two on, up by the upper sides is where cameras look: at a ceiling, or down on a slope of 30
+#: degrees and more (choice).
+MIN_SIDES_PRODUCT = 0.4
 #: Nobody rolls cameras by so much (squared sine, mean): an axis that asks for it is not up (choice). Right vectors that
 #: spread by less are parallel; they fit a hillside too, so that only an axis along them is ruled out.
 MAX_ROLL, MAX_ROLL_PARALLEL = float(np.sin(np.radians(10.0))) ** 2, 0.5
@@ -40,7 +44,37 @@ TURNED = 0.75
 VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0
 #: How up was found where the upper sides of photographs say which way it is.
 UPPER_SIDES = "upper sides of the photographs up"
+#: What may be taken for what where photographs all look one way.
+OR_WALL = (
+    "all photographs look the same way with the same side up: straight down on ground, or level at a wall. Taken for "
+    "down"
+)
+OR_SLOPE = (
+    "all photographs look the same way with the same side up: up at a ceiling, or straight down on a steep slope. "
+    "Taken for a ceiling"
+)
 HINT = "--up x|y|z|-x|-y|-z says it outright."
+
+
+class OtherUp(NamedTuple):
+    """Up if photographs that all look one way were taken the other way that looks alike."""
+
+    direction: np.ndarray
+    """Unit [3], in the world of the cameras."""
+    doubt: str
+    """What may be taken for what, in words: a sentence without its end."""
+
+
+class UpByViews(NamedTuple):
+    """Up as views tell it."""
+
+    direction: np.ndarray
+    """Unit [3], in the world of the cameras."""
+    deviation_deg: float
+    sure: bool
+    """Whether up cannot be down."""
+    other: OtherUp | None = None
+    """None where photographs that were taken otherwise would not look alike."""
 
 
 class _Views(NamedTuple):
@@ -66,22 +100,33 @@ def estimate_up(
     `centers` [n, 3], `rotations` [n, 3, 3] (rows: right, down and forward of a camera) and `points` [m, 3] in the
     source world. All of it turns with the world (no per-axis medians).
     """
-    views = _views(rotations)
+    up, how, _ = _estimate(_views(rotations), centers, points, warnings)
+    return up, how
+
+
+def _estimate(
+    views: _Views, centers: np.ndarray, points: np.ndarray, warnings: list[str]
+) -> tuple[np.ndarray, str, OtherUp | None]:
+    """What `estimate_up` gives, and what else up may be."""
     axis, how = _axis(views, centers, points, warnings)
     own, looking = float(views.image_up @ axis), float(views.forward @ axis)
+    one_side = views.same_side and views.parallel and not _turn_about(axis, views.rights, views.image_up)
     if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
-        return (-axis if own < 0 else axis), f"{how}, {UPPER_SIDES}"
+        other = None
+        if one_side and own * looking >= MIN_SIDES_PRODUCT:
+            other = OtherUp(-views.forward / np.linalg.norm(views.forward), OR_SLOPE)
+            warnings.append(f"{OR_SLOPE}; if it is a slope, {HINT}")
+        return (-axis if own < 0 else axis), f"{how}, {UPPER_SIDES}", other
     if abs(looking) >= MIN_VIEW_COSINE:
-        one_side = views.same_side and views.parallel and 2 * abs(own) < abs(looking)
-        if one_side and not _turn_about(axis, views.rights, views.image_up):
-            warnings.append(
-                "all photographs look the same way with the same side up: straight down on ground, or level at a "
-                f"wall. Taken for down; if it is a wall, {HINT}"
-            )
-        return (-axis if looking > 0 else axis), f"{how}, against the view"
+        other = None
+        if one_side and 2 * abs(own) < abs(looking):
+            level = _level(views.rights, views.image_up)
+            other = OtherUp(-level if level @ views.image_up < 0 else level, OR_WALL)
+            warnings.append(f"{OR_WALL}; if it is a wall, {HINT}")
+        return (-axis if looking > 0 else axis), f"{how}, against the view", other
     above = float(np.median(centers @ axis) - np.median(points @ axis))
     warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
-    return (-axis if above < 0 else axis), f"{how}, cameras above"
+    return (-axis if above < 0 else axis), f"{how}, cameras above", None
 
 
 def _views(rotations: np.ndarray) -> _Views:
@@ -162,27 +207,25 @@ def _level(rights: np.ndarray, image_up: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.eigh(moment)[1][:, 0])
 
 
-def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float, bool]:
-    """Up as `estimate_up` has it, joined with the mean view where that looks down; its standard deviation in degrees;
-    and whether up cannot be down."""
+def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) -> UpByViews:
+    """Up as `estimate_up` has it, joined with the mean view where that looks down."""
     doubts: list[str] = []
-    up, how = estimate_up(centers, rotations, points, doubts)
+    up, how, other = _estimate(_views(rotations), centers, points, doubts)
     mean = -rotations[:, 2].mean(axis=0)
-    if np.linalg.norm(mean) < LOOKS_DOWN or how.startswith("level"):
-        return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
     length = float(np.linalg.norm(mean))
+    # Level at a wall, or nearly so: all views are one, but not down.
+    if length < LOOKS_DOWN or how.startswith("level") or UPPER_SIDES in how:
+        return UpByViews(up, UNCERTAIN_DEG if doubts else LEVEL_DEG, not doubts, other)
     mean = mean / length
-    if UPPER_SIDES in how:  # level at a wall, or nearly so: all views are one, but not down
-        return up, (UNCERTAIN_DEG if doubts else LEVEL_DEG), not doubts
     if up @ mean < np.cos(np.radians(AGREE_DEG)):  # a slope, or a lone oblique look: the views are nearer to the truth
         apart = float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1))))
         left = float(np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[1])
         doubt = min(_lean_deg(length, left), apart / 2) if left < TURNED else apart / 2
-        return mean, max(VIEWS_DEG, doubt), bool(up @ mean > 0)
+        return UpByViews(mean, max(VIEWS_DEG, doubt), bool(up @ mean > 0), other)
     one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
     middle = up + (1 if one_way else 2) * mean
     deviation = UNCERTAIN_DEG if doubts and one_way else VIEWS_DEG * (2 if one_way else 1)  # maybe level at a wall
-    return middle / np.linalg.norm(middle), deviation, not doubts
+    return UpByViews(middle / np.linalg.norm(middle), deviation, not doubts, other)
 
 
 def _lean_deg(length: float, left: float) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem
-from vdgs.captures.position_fit import fit_positions
+from vdgs.captures.position_fit import fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.errors import CaptureError
@@ -43,6 +43,7 @@ ADVICE_BETTER_POSITIONS = (
     "finished capture is placed anew in seconds. --georeference anyway uses the positions as they are, off leaves "
     "them out; next time take photographs over many times more than positions are wrong by."
 )
+ADVICE_UP = "surveyed points (--gcp), altitudes or recorded attitudes tell it."
 ANYWAY = "Mend them, or say --georeference off (without them) or anyway (as they are)."
 
 
@@ -107,6 +108,9 @@ def georegister(
         relative=relative_deviations(deviations),
         has_altitudes=positions.has_altitudes,
     )
+    problem, in_doubt = with_likelier_up(problem)
+    notes += [f"{in_doubt}. If that is wrong, up is off by a right angle: {ADVICE_UP}"] if in_doubt else []
+    up = problem.up
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
     fit, barometer, over_ground = _best_fit(levelled, taken)
@@ -136,6 +140,7 @@ def georegister(
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
     notes += of_reading + of_line + of_north + list(filter(None, [weighing_note(fit.deviations, fit.inliers)]))
+    accuracy = accuracy_of(fit, positions, offsets)
     return Georegistration(
         similarity=fit.similarity,
         method=_method(fit, barometer, on_a_line, positions.source, up.how),
@@ -144,7 +149,7 @@ def georegister(
         residuals=_recorded(fit.placed - levelled.targets, positions),
         inliers=fit.inliers,
         deviations=fit.deviations,
-        accuracy=accuracy_of(fit, positions, offsets),
+        accuracy=replace(accuracy, level_deg=max(accuracy.level_deg or 0.0, 90.0)) if in_doubt else accuracy,
         notes=tuple(notes),
     )
 

@@ -29,6 +29,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 
 #: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
+#: So many positions and more tell the slope that a flight follows (choice).
+MIN_FOR_SLOPE = 8
 #: Why a focal length is held until the model shows whether it can be fitted: `release_focal`.
 OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`.
@@ -94,8 +96,11 @@ def _by_flight(photographs: Sequence[ImageMetadata], bent: bool) -> tuple[bool, 
     if not bent and len(heights) >= 3:
         steady = MIN_HEIGHT_SPREAD * abs(np.median(heights))
         if _range(heights) > steady:
-            several = _range(heights - _of_flights(heights, flights)) > steady
-            return (False, "flown at several heights, which tell it") if several else (True, OF_FLIGHTS)
+            if _range(heights - _of_flights(heights, flights)) <= steady:
+                return True, OF_FLIGHTS
+            if _range(_over_slope(heights, known)) <= steady:
+                return True, "flown at one height over a slope: the flight cannot tell it"
+            return False, "flown at several heights, which tell it"
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
     return None
@@ -116,6 +121,17 @@ def _of_flights(heights: np.ndarray, flights: np.ndarray) -> np.ndarray:
     """For each photograph the median height of its flight [n]."""
     medians = {number: np.median(heights[flights == number]) for number in np.unique(flights)}
     return np.array([medians[number] for number in flights])
+
+
+def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np.ndarray:
+    """Heights [n] over the plane through them that fits best; as they are where positions do not tell one."""
+    places = np.array([photo.lat_lon or (np.nan, np.nan) for photo in photographs])
+    if len(places) < MIN_FOR_SLOPE or not np.isfinite(places).all():
+        return heights
+    middle = places.mean(axis=0)
+    away = (places - middle) * [1.0, np.cos(np.radians(middle[0]))]
+    terms = np.column_stack([np.ones(len(away)), away / max(np.abs(away).max(), 1e-12)])
+    return np.asarray(heights - terms @ np.linalg.lstsq(terms, heights, rcond=None)[0])
 
 
 def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str], threads: int) -> tuple[bool, str]:

@@ -36,8 +36,8 @@ def up_of(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
     images = {image.name: image for image in model.images.values() if image.has_pose and image.name not in poles}
     rotations = np.array([camera_rotation(image) for image in images.values()])
     centers = np.array([image.projection_center() for image in images.values()])
-    direction, deviation, sure = up_by_views(centers, rotations, model_points(model))
-    views = Up(direction, deviation, "the views", sure)
+    seen = up_by_views(centers, rotations, model_points(model))
+    views = Up(seen.direction, seen.deviation_deg, "the views", seen.sure, other=seen.other)
     recorded = {photo.name: photo.attitude.gravity for photo in photographs if photo.attitude and photo.name in images}
     if len(recorded) < max(MIN_ATTITUDES, len(images) / 2):
         return views, []

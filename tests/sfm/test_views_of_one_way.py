@@ -1,0 +1,131 @@
+"""Photographs that all look one way: walls, ceilings, slopes and lines that look alike, which positions may tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vdgs.errors import CaptureError
+from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, georegister
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_metadata import attitude_from_gimbal
+from vdgs.sfm.up_direction import up_of
+
+#: The model's world is turned from east, north, up.
+TURN = Rotation.random(random_state=3).as_matrix()
+
+
+def taken_from(
+    places: np.ndarray, points: np.ndarray, angles: tuple[float, float], wrong_m: float = 0.0, recorded: bool = False,
+    seed: int = 0, heights: np.ndarray | None = None,
+) -> tuple[SimpleNamespace, list[SimpleNamespace], GpsPriors]:  # fmt: skip
+    """A model of cameras at places [n, 3] with one yaw and pitch (degrees), its photographs, and their positions, which
+    are wrong by so much. `heights` [n] stand in for the altitudes."""
+    rng, count = np.random.default_rng(seed), len(places)
+    images, photographs = {}, []
+    for k, place in enumerate(places):
+        pose = attitude_from_gimbal(angles[0] + rng.normal(0, 0.5), angles[1] + rng.normal(0, 0.5), 0.0).camera_from_enu
+        images[k] = SimpleNamespace(
+            name=str(k), has_pose=True, points2D=(), projection_center=lambda place=place: TURN @ place,
+            cam_from_world=lambda pose=pose @ TURN.T: SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: pose)),
+        )  # fmt: skip
+        attitude = attitude_from_gimbal(*angles, 0.0) if recorded else None
+        photographs.append(
+            SimpleNamespace(name=str(k), attitude=attitude, face="", datetime="", subsecond=None, gps_std=None,
+                            relative_altitude=None)
+        )  # fmt: skip
+    enu = places + rng.normal(0, 1, places.shape) * wrong_m * [1, 1, 1.5]
+    enu[:, 2] = enu[:, 2] if heights is None else heights
+    positions = GpsPriors(
+        enu=enu, gps_std=np.tile([1.0, 1, 2], (count, 1)), image_indices=np.arange(count), origin=(47.3, 8.5, 500.0),
+        altitude_reference="", source="EXIF", notes=(),
+    )  # fmt: skip
+    model = SimpleNamespace(
+        images=images, points3D={k: SimpleNamespace(xyz=TURN @ point) for k, point in enumerate(points)}
+    )
+    return model, photographs, positions
+
+
+def wall(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform([-30, -0.3, 0], [30, 0.3, 40], (400, 3))
+
+
+def before_a_wall() -> np.ndarray:
+    """Up and down, 18 m before it."""
+    across, up = np.meshgrid(np.linspace(-12, 12, 5), np.linspace(10, 28, 4), indexing="ij")
+    return np.stack([across.ravel(), np.full(20, -18.0), up.ravel()], axis=1)
+
+
+def up_off_deg(placed: Georegistration) -> float:
+    """How far up of a placed model is from what it is."""
+    return float(np.degrees(np.arccos(np.clip((placed.similarity.rotation @ TURN)[2, 2], -1, 1))))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_positions_tell_a_flight_before_a_wall_from_one_over_ground(seed):
+    model, photographs, positions = taken_from(before_a_wall(), wall(), (0.0, 0.0), wrong_m=0.5, seed=seed)
+    assert not up_of(model, photographs)[0].sure
+    placed = georegister(model, photographs, positions)
+    assert isinstance(placed, Georegistration)
+    assert up_off_deg(placed) < 6
+    assert placed.similarity.scale == pytest.approx(1, abs=0.1)
+    assert not any("look the same way" in note for note in placed.notes)
+
+
+def test_where_positions_cannot_tell_it_is_said_and_counts_as_an_error_of_up():
+    """A single row before a wall is congruent with one over ground."""
+    row = np.stack([np.linspace(-14, 14, 12), np.full(12, -18.0), np.full(12, 15.0)], axis=1)
+    model, photographs, positions = taken_from(row, wall(), (0.0, 0.0), wrong_m=0.5)
+    placed = georegister(model, photographs, positions)
+    assert isinstance(placed, Georegistration)
+    assert placed.accuracy is not None
+    assert placed.accuracy.level_deg >= 90
+    assert any("level at a wall. Taken for down, for the positions do not tell" in note for note in placed.notes)
+    told = georegister(*taken_from(row, wall(), (0.0, 0.0), wrong_m=0.5, recorded=True))
+    assert isinstance(told, Georegistration)
+    assert up_off_deg(told) < 5
+    assert told.accuracy is not None
+    assert told.accuracy.level_deg < 20
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("slope_deg", [35.0, 48.0, 60.0])
+def test_flights_straight_over_a_slope_with_the_top_of_photographs_uphill_are_not_mirrored(slope_deg, recorded):
+    """By their upper sides they look up at a ceiling."""
+    rise = np.tan(np.radians(slope_deg))
+    across, along = (each.ravel() for each in np.meshgrid(np.arange(5) * 12.0, np.arange(5) * 12.0, indexing="ij"))
+    ground = np.random.default_rng(1).uniform([-20, -20, 0], [70, 70, 1], (400, 3))
+    ground[:, 2] += rise * ground[:, 1]
+    places = np.stack([across, along, rise * along + 40], axis=1)
+    placed = georegister(*taken_from(places, ground, (0.0, -90.0), wrong_m=0.5, recorded=recorded))
+    assert isinstance(placed, Georegistration)
+    assert up_off_deg(placed) < 5
+    assert placed.similarity.scale == pytest.approx(1, abs=0.1)
+
+
+def test_positions_that_do_not_spread_are_no_scale():
+    """Straight up along a tower, with one altitude recorded: any drift of it would explain any scale."""
+    rise = np.stack([np.full(13, 22.0), np.full(13, 3.0), np.arange(4.0, 30, 2)], axis=1)
+    model, photographs, positions = taken_from(rise, wall(), (262.0, 0.0), wrong_m=0.5, heights=np.full(13, 20.0))
+    assert isinstance(georegister(model, photographs, positions), AlignmentFailure)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_positions_along_a_line_are_not_called_exchanged_by_chance(seed):
+    """A line is its own mirror image, and exchanged axes stretch the errors across it."""
+    line = np.stack([np.linspace(-14, 14, 12), np.full(12, -18.0), np.full(12, 15.0)], axis=1)
+    model, photographs, positions = taken_from(line, wall(), (0.0, 0.0), wrong_m=1.0, recorded=True, seed=seed)
+    for turn in np.radians([0, 30, 60, 90]):
+        turned = positions.enu @ Rotation.from_rotvec([0, 0, turn]).as_matrix().T
+        georegister(model, photographs, replace(positions, enu=turned))
+
+
+def test_mirrored_positions_of_a_wall_are_refused_all_the_same():
+    model, photographs, positions = taken_from(before_a_wall() + np.outer(np.arange(20) % 4, [0, 4.0, 0]), wall(),
+                                               (0.0, 0.0), wrong_m=0.1, recorded=True)  # fmt: skip
+    with pytest.raises(CaptureError, match="fit the photographs only once"):
+        georegister(model, photographs, replace(positions, enu=positions.enu * [-1, 1, 1]))
