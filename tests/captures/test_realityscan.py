@@ -19,6 +19,7 @@ from support.known_flight import (
     known_flight,
 )
 from support.project_reading import check_numbers, read
+from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.formats import realityscan
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.config.capture_options import CaptureOptions
@@ -248,6 +249,21 @@ def test_rows_that_end_before_the_lens_are_refused(tmp_path: Path, flight: Known
     file.write_text("\n".join(lines))
     with pytest.raises(CaptureError, match=r"1 of its rows(.|\n)*line 4: ends before \w+, \w+, \w+$"):
         read(tmp_path, "realityscan")
+
+
+def test_equal_names_in_a_project_that_knows_no_folders_need_names_of_their_own(
+    tmp_path: Path, flight: KnownFlight
+) -> None:
+    """No choice of a folder tells them apart, and none is advised."""
+    names = [f"DJI_{k % 6:04d}.JPG" for k in range(12)]
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", replace(flight, names=names))
+    replace(flight, names=[f"{'ab'[k // 6]}/{name}" for k, name in enumerate(names)]).write_photographs(
+        tmp_path / "images"
+    )
+    for images in (None, str(tmp_path / "images" / "a")):
+        with pytest.raises(CaptureError, match=r"names of their own(.|\n)*export it again") as refused:
+            read_source(tmp_path, CaptureOptions(images=images), needs_points=False)
+        assert "--images" not in str(refused.value)
 
 
 @pytest.mark.parametrize("as_table", [True, False])

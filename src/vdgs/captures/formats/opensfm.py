@@ -39,8 +39,8 @@ _HEAD_BYTES = 2048
 #: Positions that are told twice differ by less (about a metre on Earth, and in one system).
 _SAME_PLACE_DEG, _SAME_PLACE_M = 1e-5, 0.01
 _AGAIN = "Export it again."
-#: What other lists of cameras hold: what vdgs writes, and the cameras of a trained 3DGS scene.
-_OTHER_LISTS = (b"matrix_world", b'"img_name"')
+#: What other lists of cameras hold: what vdgs writes, the cameras of a trained 3DGS scene, and UAVScenes.
+_OTHER_LISTS = (b"matrix_world", b'"img_name"', b'"OriginalImageName"')
 _UNDISTORT = "Undistort the photographs (opensfm undistort), and give the undistorted folder"
 #: COLMAP's model of each projection, and its distortion in COLMAP's order; with one focal length or two.
 _ONE_FOCAL = {"perspective": ("RADIAL", ("k1", "k2")), "fisheye": ("RADIAL_FISHEYE", ("k1", "k2"))}
@@ -61,8 +61,8 @@ def find_files(root: Path) -> list[Path]:
 
 
 def is_file(file: Path) -> bool:
-    """Whether a file is a reconstruction, which is a list (the file of this name that vdgs writes itself is not, and
-    the cameras of a trained 3DGS scene are no reconstruction), or the report of an ODM project."""
+    """Whether a file is a reconstruction, which is a list, as others are that are none (`_OTHER_LISTS`), or the report
+    of an ODM project."""
     if file.suffix not in (".json", ".geojson"):
         return False
     try:
