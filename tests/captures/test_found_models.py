@@ -199,6 +199,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("gt.txt", 2 * "1305031102.1758 1.3405 0.6266 -1.6575 0.6574 0.6126 -0.2949 -3.3e-1\n", "like those of TUM"),
         ("poses.csv", "image,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,0,0,0\n", "quaternions without lenses.*transforms.json"),
         ("poses.txt", "#name x y z q_x q_y q_z q_w\na.jpg 1 2 3 0 0 0 1\n", "quaternions without lenses.*--gps FILE"),
+        ("a.csv", "#name,x,y,alt,heading,pitch,roll\na.jpg,1,2,3,4,5,6\n", "poses of RealityScan without lenses"),
         ("eo.csv", "name,x,y,z,omega,phi,kappa\na.jpg,1,2,3,4,5,6\n", "omega, phi, kappa.*--gps FILE"),
         ("opk.txt", "PhotoID,X,Y,Z,Omega,Phi,Kappa\na.jpg,1,2,3,4,5,6\n", "Agisoft XML.*--gps FILE"),
         ("eo.txt", "$IMAGE X Y Z OMEGA PHI KAPPA\na.jpg 1 2 3 4 5 6\n", "omega, phi, kappa"),

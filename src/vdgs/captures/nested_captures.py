@@ -139,6 +139,11 @@ _BY_CONTENT = (
         ".txt", rb"\A\s*(?:(?:[-+.\de]+[ \t]+){3}[-+.\de]+[ \t]*\r?\n\s*){2}(?:[-+.\de]+[ \t]+){3}[-+.\de]+\s*\Z",
         f"a projection matrix of a photograph (DTU); {_WRITE}",
     ),
+    (
+        ".csv", rb"\A#?name,x,y,(?:alt|z),(?:heading|yaw),pitch,roll *\r?\n",
+        "poses of RealityScan without lenses; its registration with 'Internal/External camera parameters' is read"
+        + _POSITIONS,
+    ),
     (".csv", rb"\A#timestamp.*p_rs_r_x", f"poses of EuRoC; {_WRITE}"),
     (
         ".txt", rb"\A\s*extrinsic\s",

@@ -257,7 +257,8 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
     delimiter, names = found
     if _FOCAL.isdisjoint(names):
         raise CaptureError(
-            f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead."
+            f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead; a table "
+            "of positions is given beside the photographs, as --gps."
         )
     cameras, problems = [], []
     rows = csv.reader(io.StringIO("\n".join(lines[start + 1 :])), delimiter=delimiter)
