@@ -18,6 +18,7 @@ from vdgs.captures.format_dispatch import lacks_points
 from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import foreign_poses
 from vdgs.captures.output_guard import is_capture
+from vdgs.captures.project_formats import is_project
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import collect_images, is_image_folder
@@ -187,15 +188,53 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("pose/b.txt", "\n".join([*3 * ["1 0 -2e-3 4.5"], "0 0 0 1", ""]), "as transforms.json"),
         ("bbox.txt", "-1 -1 -1 1 1 1 0.1 and no more\n", "a set of NSVF"),
         ("gt/data.csv", "#timestamp, p_RS_R_x [m], p_RS_R_y [m]\n1,2,3\n", "poses of EuRoC"),
+        ("poses.txt", "".join(f"{k} {' '.join(12 * ['-2.5e-1'])}\n" for k in (1, 5)), "poses of KITTI-360"),
+        ("cam0_to_world.txt", "".join(f"{k} {' '.join(16 * ['0.5'])} \n" for k in (1, 5)), "poses of KITTI-360"),
+        ("sampleinfos_interpolated.json", '[{"OriginalImageName": "1.jpg", "T4x4": []}]', "poses of UAVScenes"),
+        ("Ori-1/Ori-PerspCentral-a.jpg.xml", "<Root><CameraPose><Center/></CameraPose></Root>", "poses of MMVII"),
+        ("views/view_0000.mve/meta.ini", "[camera]\nfocal_length = 0.9\nrotation = 1 0 0", "poses of MVE"),
+        ("calib/pos_001.txt", "9.5 -1e2 2 3\n4 5 -6 7\n0.1 0.2 0.3 654.5\n", "(DTU)"),
+        ("frame_00001.json", '{"cameraPoseARFrame": [0.1, 0.2], "intrinsics": [1]}', "3D Scanner App"),
+        ("poses_ts.json", '{"timestamps": [1, 2, 3], "poses": []}', "poses of OMMO"),
+        ("gt.txt", 2 * "1305031102.1758 1.3405 0.6266 -1.6575 0.6574 0.6126 -0.2949 -3.3e-1\n", "like those of TUM"),
+        ("poses.csv", "image,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,0,0,0\n", "quaternions without lenses.*transforms.json"),
+        ("poses.txt", "#name x y z q_x q_y q_z q_w\na.jpg 1 2 3 0 0 0 1\n", "quaternions without lenses.*--gps FILE"),
+        ("a.csv", "#name,x,y,alt,heading,pitch,roll\na.jpg,1,2,3,4,5,6\n", "poses of RealityScan without lenses"),
+        ("eo.csv", "name,x,y,z,omega,phi,kappa\na.jpg,1,2,3,4,5,6\n", "omega, phi, kappa.*--gps FILE"),
+        ("opk.txt", "PhotoID,X,Y,Z,Omega,Phi,Kappa\na.jpg,1,2,3,4,5,6\n", "Agisoft XML.*--gps FILE"),
+        ("eo.txt", "$IMAGE X Y Z OMEGA PHI KAPPA\na.jpg 1 2 3 4 5 6\n", "omega, phi, kappa"),
+        (
+            "bundle.out",
+            "2 1\n700.5 -0.1 0.02\n1 0 0\n0 1 0\n0 0 1\n-1e-3 2 3\n",
+            "without the first line of their file; with the line",
+        ),
+        ("flight.r3d", '<?xml version="1.0"?>\n<Regard3D version="1"/>', "a project of Regard3D; OpenMVG"),
+        ("film.r3d", "PK\x03\x04 and so on, for some bytes", "a capture of Record3D"),
         ("AT/sfm_geo_desc.json", '{"is_georeferenced": true, "x": 1}', "BlocksExchange"),
     ],
 )
 def test_files_that_only_their_beginning_tells_are_said(tmp_path, name, text, says):
     write_images(tmp_path, tiny_scene(width=160, height=120))
-    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text(text)
     with pytest.raises(CaptureError, match=rf"not a capture. Not read: .*{Path(name).name}: .*{says}"):
         load_capture(tmp_path)
+    assert len(foreign_poses(tmp_path)) == 1
+    if is_project(tmp_path / name):  # whose reader refuses it
+        return
+    with pytest.raises(CaptureError, match=rf"{Path(name).name}: is .*{says}"):
+        load_capture(tmp_path / name)
+
+
+def test_other_texts_of_numbers_are_no_poses(tmp_path):
+    texts = {
+        "points.txt": 2 * "1.5 2.5 3.5 255 255 255 0 1\n", "images.txt": "# Image list\n# ID, QW, QX, QY, QZ, TX\n",
+        "counts.txt": "1 2 3 4\n5 6 7 8\n", "log.csv": f"{'x' * 4000}\n", "list.out": "12 photographs\nof a flight\n",
+        "positions.csv": "name,lat,lon,alt,yaw,pitch,roll\na.jpg,47,8,500,1,2,3\n",
+    }  # fmt: skip
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    assert foreign_poses(tmp_path) == []
 
 
 def test_a_kind_of_files_is_named_once(tmp_path):

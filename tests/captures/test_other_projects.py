@@ -96,6 +96,41 @@ def test_undistorted_folder_of_odm_is_read_in_its_utm(tmp_path: Path, flight: Kn
     check_numbers(read(tmp_path / "opensfm" / "undistorted", "opensfm"), flight)
 
 
+@pytest.mark.parametrize("in_utm", [True, False])
+@pytest.mark.parametrize("told_by", ["shots", "coords"])
+def test_gps_tells_whether_an_odm_project_was_moved_to_utm(
+    tmp_path: Path, flight: KnownFlight, in_utm: bool, told_by: str
+) -> None:
+    """Where neither the topocentric reconstruction nor the report is there; GPS is off by metres."""
+    file = writers.write_opensfm(tmp_path / "opensfm", flight)
+    flight.write_photographs(tmp_path / "images")
+    before = file.read_text()
+    _write_utm_reconstruction(tmp_path, file, flight)
+    if not in_utm:
+        file.write_text(before)
+    off = np.random.default_rng(2).normal(0, 3, flight.centers.shape)
+    if told_by == "shots":
+        content = json.loads(file.read_text())
+        for shot, place in zip(content[0]["shots"].values(), flight.centers + off, strict=True):
+            shot["gps_position"] = place.tolist()
+        file.write_text(json.dumps(content))
+    else:
+        coordinates = tmp_path / "odm_georeferencing" / "coords.txt"
+        shift = np.append(np.array(coordinates.read_text().splitlines()[1].split(), float), 0.0)
+        gps = writers.utm_flight(flight)[3] - shift + off
+        coordinates.write_text(coordinates.read_text() + "".join(f"{x} {y} {z}\n" for x, y, z in gps))
+    source = read(tmp_path, "opensfm")
+    check_numbers(source, flight)
+    assert not source.warnings
+
+
+def test_odm_project_that_may_be_in_utm_or_not_is_named(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_opensfm(tmp_path / "opensfm", flight)
+    flight.write_photographs(tmp_path / "images")
+    _write_utm_reconstruction(tmp_path, file, flight)
+    assert any("nothing tells which" in note for note in read(tmp_path, "opensfm").warnings)
+
+
 def _write_utm_reconstruction(project: Path, file: Path, flight: KnownFlight) -> None:
     code, poses, points, centers = writers.utm_flight(flight)
     offset = np.append(np.floor(centers[:, :2].mean(axis=0)), 0.0)

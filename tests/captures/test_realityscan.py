@@ -15,14 +15,16 @@ from support.known_flight import (
     BentLens,
     KnownFlight,
     centers_of,
+    ecef,
     known_flight,
 )
 from support.project_reading import check_numbers, read
+from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.formats import realityscan
 from vdgs.captures.formats.brown_lens import brown_intrinsics
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.geometry.geodesy import enu_axes, geodetic_from_enu, is_earth_centered
 
 
 @pytest.fixture
@@ -137,8 +139,6 @@ def test_table_of_realityscan_in_degrees_is_placed(tmp_path: Path, flight: Known
 
 def _turned_to_each_place(flight: KnownFlight) -> KnownFlight:
     """The flight with the rotation of each camera about the east, north and up of where it is."""
-    from vdgs.geometry.geodesy import enu_axes
-
     poses = np.array(flight.poses)
     for pose, (latitude, longitude, _) in zip(poses, geodetic_from_enu(flight.centers, ORIGIN), strict=True):
         pose[:3, :3] = pose[:3, :3] @ enu_axes(*ORIGIN[:2]) @ enu_axes(latitude, longitude).T
@@ -236,6 +236,56 @@ def test_rows_that_cannot_be_read_are_told_all_at_once(tmp_path: Path, flight: K
     file.write_text("\n".join(lines))
     with pytest.raises(CaptureError, match=r"2 of its rows(.|\n)*line 3(.|\n)*line 6"):
         read(tmp_path, "realityscan")
+
+
+@pytest.mark.parametrize("for_opencv", [True, False])
+def test_rows_that_end_before_the_lens_are_refused(tmp_path: Path, flight: KnownFlight, for_opencv: bool) -> None:
+    """The terms that are cut off would be taken for zeros."""
+    write = writers.write_realityscan_opencv_csv if for_opencv else writers.write_realityscan_csv
+    file = write(tmp_path / "cameras.csv", flight)
+    flight.write_photographs(tmp_path / "images")
+    lines = file.read_text().splitlines()
+    lines[3] = lines[3].rsplit(",", 3)[0]
+    file.write_text("\n".join(lines))
+    with pytest.raises(CaptureError, match=r"1 of its rows(.|\n)*line 4: ends before \w+, \w+, \w+$"):
+        read(tmp_path, "realityscan")
+
+
+def test_equal_names_in_a_project_that_knows_no_folders_need_names_of_their_own(
+    tmp_path: Path, flight: KnownFlight
+) -> None:
+    """No choice of a folder tells them apart, and none is advised."""
+    names = [f"DJI_{k % 6:04d}.JPG" for k in range(12)]
+    writers.write_realityscan_csv(tmp_path / "cameras.csv", replace(flight, names=names))
+    replace(flight, names=[f"{'ab'[k // 6]}/{name}" for k, name in enumerate(names)]).write_photographs(
+        tmp_path / "images"
+    )
+    for images in (None, str(tmp_path / "images" / "a")):
+        with pytest.raises(CaptureError, match=r"names of their own(.|\n)*export it again") as refused:
+            read_source(tmp_path, CaptureOptions(images=images), needs_points=False)
+        assert "--images" not in str(refused.value)
+
+
+@pytest.mark.parametrize("as_table", [True, False])
+def test_earth_centred_cameras_are_placed(tmp_path: Path, flight: KnownFlight, as_table: bool) -> None:
+    axes, centers = enu_axes(*ORIGIN[:2]), ecef(flight.centers)
+    poses = np.array(flight.poses)
+    poses[:, :3, :3] = poses[:, :3, :3] @ axes
+    poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], centers)
+    flight.write_photographs(tmp_path / "images")
+    if as_table:
+        writers.write_realityscan_csv(tmp_path / "cameras.csv", flight, centers, poses)
+    else:
+        writers.write_realityscan_xmp(tmp_path / "images", replace(flight, poses=poses))
+    source = read(tmp_path, "realityscan")
+    check_numbers(source, flight)
+    assert source.georef is not None
+    assert "Earth-centred" in source.georef.method
+
+
+def test_projected_coordinates_as_far_from_their_origin_as_the_earth_is_wide_are_not_earth_centred() -> None:
+    assert not is_earth_centered(np.array([[500_000.0, 6_360_000.0, 80.0]]))  # UTM in Scotland
+    assert is_earth_centered(ecef(np.zeros((1, 3))))
 
 
 def test_skew_and_aspect_of_xmp_are_read_to_their_numbers(tmp_path: Path, flight: KnownFlight) -> None:

@@ -50,6 +50,22 @@ def test_a_table_beside_photographs_is_named_before_the_work(tmp_path, name):
     assert said == [f"{file} beside the photographs holds positions of 3 of 3; not used. To use it: --gps {path}"]
 
 
+@pytest.mark.parametrize("first_line", ["EPSG:32632\n", ""])
+def test_a_table_of_positions_with_angles_is_no_registration(tmp_path, first_line):
+    """A receiver's program writes the columns of RealityScan's table but those of the lens."""
+    text = f"{first_line}image,easting,northing,height,yaw,pitch,roll\n" + "".join(
+        f"{{{k}}},46200{k},5216000,540,{90 + k},-90,0\n" for k in range(3)
+    )
+    _, (said,) = planned(tmp_path, "card/ppk.csv", text, placed=True)
+    file = tmp_path / "card" / "ppk.csv"
+    if not first_line:
+        assert f"{file}: has the columns 'easting' and 'northing' but does not say of which coordinate system" in said
+        return
+    assert "holds positions of 3 of 3; not used. To use it: --gps" in said
+    request = SfmRequest(image_folders=(tmp_path / "card",), output=tmp_path / "new", gps=file)
+    assert len(plan_reconstruction(request).gps_priors) == 3
+
+
 @pytest.mark.parametrize("name", ["card/geo.txt", "geo.txt"])
 def test_the_table_of_odm_is_used_where_photographs_say_no_positions(tmp_path, name):
     priors, (said,) = planned(tmp_path, name, TABLES[name], placed=False)

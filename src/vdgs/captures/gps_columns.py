@@ -36,6 +36,14 @@ BY_TIME = (
 DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
 
 
+class NoSystem(CaptureError):
+    """A table of x and y whose coordinate system nothing names, with the photographs that it names."""
+
+    def __init__(self, message: str, names: Sequence[str]) -> None:
+        super().__init__(message)
+        self.names = tuple(names)
+
+
 class Columns(NamedTuple):
     """The columns of a table, and what their values count in."""
 
@@ -137,10 +145,11 @@ def _with_plane(columns: Columns, rows: Sequence[Row], system: str | None, file:
         return columns._replace(where={**known, "lon": known["x"], "lat": known["y"]}, note=note)
     x, y = words[known["x"]], words[known["y"]]
     if system is None:
-        raise CaptureError(
+        raise NoSystem(
             f"{file}: has the columns {x!r} and {y!r} but does not "
             "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
-            "give name,lat,lon,alt."
+            "give name,lat,lon,alt.",
+            [row.words[known["name"]] for row in body if len(row.words) > known["name"]],
         )
     return columns._replace(system=system, across_units=(told_meters(x), told_meters(y)))
 
@@ -167,9 +176,10 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
     places = [[number_of(word) for word in row.words[1:3]] for row in rows if len(row.words) > 2]
     largest = np.abs(np.array(places, float).reshape(-1, 2)).max(axis=0, initial=0)
     if max(largest) > 180:
-        raise CaptureError(
+        raise NoSystem(
             f"{file}: names neither its columns nor the coordinate system of values such as {words[1]}, "
-            f"{words[2]}. Write its code as a first line of its own, such as EPSG:32633."
+            f"{words[2]}. Write its code as a first line of its own, such as EPSG:32633.",
+            [row.words[0] for row in rows],
         )
     swapped = largest[0] > 90
     where = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}

@@ -41,6 +41,9 @@ _WRITE = (
     "written as transforms.json (world from camera, axes of OpenGL, with the lens) beside the photographs they are read"
 )
 _AS_OTHERS = "a BlocksExchange, OPF or Agisoft XML file of the same project is read"
+_MVE = "poses of MVE; the .nvm or bundle.out that its makescene was given is read"
+_METASHAPE_TABLE = "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read"
+_POSITIONS = "; its positions alone: --gps FILE, with the code of their coordinate system as a first line of its own"
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
     "*.psx": _METASHAPE,
@@ -63,22 +66,37 @@ _OTHERS = {
     "*.mg": "a project of Meshroom; cameras.sfm of its step StructureFromMotion is read",
     "sfm.abc": "poses of Meshroom in Alembic; cameras.sfm beside it, or the .sfm of its step ConvertSfMFormat, is read",
     "Orientation-*.xml": "poses of MicMac; mm3d Apero2NVM makes a .nvm of them, which is read",
+    "Ori-PerspCentral-*.xml": f"poses of MMVII (MicMac); {_WRITE}",
     "sensors/trajectories.txt": _KAPTURE,
     "*.mvs": "a scene of OpenMVS; the COLMAP or OpenMVG model that it was made of is read",
     "keyframes/*cameras/*.json": _POLYCAM,
-    "*.r3d": "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json of it, which is read",
     "bbox.txt": f"a set of NSVF; its pose/*.txt and intrinsics.txt are not read; {_WRITE}",
     "cameras*.npz": "poses of IDR or NeuS; the COLMAP model that they were made of is read",
     "dataparser_transforms.json": (
         "what nerfstudio's training wrote; the transforms.json or COLMAP model that it was trained on is read"
     ),
-    "synth_0.out": "poses of MVE; the .nvm or bundle.out that its makescene was given is read",
+    "synth_0.out": _MVE,
+    "views/*.mve/meta.ini": _MVE,
+    "sampleinfos_interpolated.json": f"poses of UAVScenes; {_WRITE}",
+    "poses_ts.json": f"poses of OMMO; {_WRITE}",
     "*.ori": f"orientations of PATB; {_AS_OTHERS}",
     "itera.dat": f"orientations of BINGO; {_AS_OTHERS}",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
 #: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
 _ALIGN = "it is read once its photographs are aligned and it is exported again"
+#: Tables of poses that any program may have written, by the names of their columns in one of the first lines.
+_POSE_TABLES = (
+    (
+        rb"\A(?:[^\n]*\n){0,3}[^\n]*omega[^\n]*phi[^\n]*kappa",
+        "positions and angles (omega, phi, kappa) without lenses, which are not read; as BlocksExchange, OPF, Agisoft "
+        f"XML or with the lens as transforms.json they are{_POSITIONS}",
+    ),
+    (
+        rb"\A[^\n]*(?:q_?w[^\n]*q_?x[^\n]*q_?y[^\n]*q_?z|q_?x[^\n]*q_?y[^\n]*q_?z[^\n]*q_?w)",
+        f"positions and quaternions without lenses, which are not read; {_WRITE}{_POSITIONS}",
+    ),
+)
 _BY_CONTENT = (
     (".xml", rb"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
     (".xml", rb"<document version", f"an export of Metashape without poses; {_ALIGN}"),
@@ -91,6 +109,7 @@ _BY_CONTENT = (
         "poses of BungeeNeRF; the photographs are read without them: vdgs sfm images --output CAPTURE",
     ),
     (".json", rb'"t_00"\s*:', _POLYCAM),
+    (".json", rb'"cameraposearframe"', f"poses of 3D Scanner App (ARKit); {_WRITE}"),
     (
         ".json", rb'"transform_matrix"',
         "a file of poses like transforms.json, by another name; rename it to transforms.json, which is read",
@@ -98,17 +117,32 @@ _BY_CONTENT = (
     (".json", b'"img_name"', "cameras of a trained 3DGS scene; the capture that it was trained on is read"),
     (".json", b'"sfm_data_version"', "photographs of OpenMVG without poses; the sfm_data.json after its SfM is read"),
     (".sfm", b'"viewid"', "photographs of Meshroom without poses; cameras.sfm of its step StructureFromMotion is read"),
-    (
-        ".txt", rb"photoid, x, y, z, omega",
-        "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read",
-    ),
+    *((suffix, rb"photoid, ?x, ?y, ?z, ?omega", _METASHAPE_TABLE + _POSITIONS) for suffix in (".txt", ".csv")),
     (".txt", rb"\A# *kapture format", _KAPTURE),
     (".txt", rb"# *timestamp,?\s+tx,?\s+ty,?\s+tz,?\s+qx", f"poses of TUM RGB-D; {_WRITE}"),
     (".txt", rb"\A(?:(?:[-+.\de]+ ){11}[-+.\de]+ *\r?\n){2}", f"poses of KITTI; {_WRITE}"),
+    (
+        ".txt", rb"\A(?:\d+ (?:[-+.\de]+ ){11}(?:(?:[-+.\de]+ ){4})?[-+.\de]+ *\r?\n){2}",
+        f"poses of KITTI-360; {_WRITE}",
+    ),
+    (
+        ".txt",
+        rb"\A(?:\d[.\de+]*(?: [-+]?\d[-+.\de]*){3}(?: [-+]?(?:0?\.\d+|[01](?:\.0*)?|[.\d]+e-\d+)){4} *\r?\n){2}",
+        f"poses like those of TUM RGB-D; {_WRITE}",
+    ),
     (".txt", rb"\Ap0: (?:[-+.\de]+ ){11}", f"lenses of KITTI; {_WRITE}"),
     (
         ".txt", rb"\A\s*(?:[-+.\de]+\s+){12}(?:[-+]?0(?:\.0*)?(?:e[-+]\d+)?\s+){3}1(?:\.0*)?(?:e\+?0+)?\s*\Z",
         f"a matrix of a photograph (NSVF, NeRF-OSR, ScanNet, 7-Scenes); {_WRITE}",
+    ),
+    (
+        ".txt", rb"\A\s*(?:(?:[-+.\de]+[ \t]+){3}[-+.\de]+[ \t]*\r?\n\s*){2}(?:[-+.\de]+[ \t]+){3}[-+.\de]+\s*\Z",
+        f"a projection matrix of a photograph (DTU); {_WRITE}",
+    ),
+    (
+        ".csv", rb"\A#?name,x,y,(?:alt|z),(?:heading|yaw),pitch,roll *\r?\n",
+        "poses of RealityScan without lenses; its registration with 'Internal/External camera parameters' is read"
+        + _POSITIONS,
     ),
     (".csv", rb"\A#timestamp.*p_rs_r_x", f"poses of EuRoC; {_WRITE}"),
     (
@@ -123,6 +157,18 @@ _BY_CONTENT = (
         ".csv", rb"\A\s*timestamp, *frame, *x, *y, *z, *qx",
         "poses of Stray Scanner; the film beside it is read without them: vdgs sfm rgb.mp4 --output CAPTURE",
     ),
+    # The phone's film is a container, and the file of the other program XML.
+    (
+        ".r3d", rb"\A(?:\xef\xbb\xbf)?\s*<",
+        "a project of Regard3D; OpenMVG's sfm_data.bin in its folders is read once openMVG_main_ConvertSfM_DataFormat "
+        "-i sfm_data.bin -o sfm_data.json -V -I -E -S has made JSON of it",
+    ),
+    (".r3d", rb"", "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json, which is read"),
+    (
+        ".out", rb"\A\s*\d+ \d+ *\r?\n(?:(?:[-+.\de]+ +){2}[-+.\de]+ *\r?\n){5}",
+        "poses of Bundler without the first line of their file; with the line '# Bundle file v0.3' in front it is read",
+    ),
+    *((suffix, *table) for suffix in (".txt", ".csv", ".opk", ".dat") for table in _POSE_TABLES),
     (
         ".prj", rb"\$project",
         "a project of Inpho; Metashape imports it (File > Import > Import Cameras), and its Agisoft XML is read",
@@ -228,7 +274,8 @@ def foreign_poses(root: Path) -> list[str]:
         known = [(next(iter(sorted(folder.glob(name))), None), what) for name, what in _OTHERS.items()]
         known += [(file, _by_content(file)) for file in sorted(folder.iterdir())]
         for file, what in known:
-            if file is not None and what and file.is_file() and file.stat().st_size > _LEAST_BYTES:
+            is_known = file in found.values()
+            if file is not None and what and not is_known and file.is_file() and file.stat().st_size > _LEAST_BYTES:
                 found.setdefault(what, file)
     return [f"{file.relative_to(root).as_posix()}: {what}" for what, file in found.items()]
 
@@ -241,9 +288,15 @@ def check_no_foreign_file(path: Path) -> None:
     whole = _capture_of(path)
     if whole is not None:
         raise CaptureError(f"{path}: is a part of a capture. Give the folder of it all: {shell_word(whole)}")
-    what = next((what for name, what in _OTHERS.items() if fnmatch(path.name.lower(), name)), "") or _by_content(path)
+    what = next((what for name, what in _OTHERS.items() if _is_called(path, name)), "") or _by_content(path)
     if what:
         raise CaptureError(f"{path}: is {what}.")
+
+
+def _is_called(path: Path, pattern: str) -> bool:
+    """Whether a path ends in a pattern of `_OTHERS`, folders and all; case does not count."""
+    count = len(PurePath(pattern).parts)
+    return fnmatch("/".join(path.absolute().parts[-count:]).lower(), pattern.lower())
 
 
 def _capture_of(file: Path) -> Path | None:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vdgs.captures.georeference import match_rows
-from vdgs.captures.gps_tables import BY_TIME, read_gps_table
+from vdgs.captures.gps_columns import NoSystem
+from vdgs.captures.gps_tables import BY_TIME, GpsRow, read_gps_table
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 
@@ -28,21 +29,35 @@ class TableBeside(NamedTuple):
     file: Path
     photographs: int
     problem: str = ""
-    """Why ODM's own cannot be used."""
+    """Why one of photographs that are there, or ODM's own, cannot be used."""
 
 
-def position_tables(folders: Iterable[Path], names: Sequence[str]) -> list[TableBeside]:
-    """Tables in the folders that hold positions of the photographs of these names; those of most photographs first."""
+def position_tables(
+    folders: Iterable[Path], names: Sequence[str], *, without_system: bool = False
+) -> list[TableBeside]:
+    """Tables in the folders that hold positions of the photographs of these names; those of most photographs first, and
+    where asked those that do not say of which coordinate system they are."""
     found = []
     for file in _candidates(folders):
         try:
             table = read_gps_table(file)
             found.append(TableBeside(file, len(match_rows(names, table.rows, file, table.numbered))))
+        except NoSystem as error:
+            rows = [GpsRow(0, name, (0.0, 0.0, 0.0)) for name in error.names]
+            if file.name.lower() == ODM_POSITIONS or (without_system and _count(names, rows, file) >= _MIN_ROWS):
+                found.append(TableBeside(file, 0, str(error)))
         except CaptureError as error:  # mostly some other text
             found += [TableBeside(file, 0, str(error))] if file.name.lower() == ODM_POSITIONS else []
     return sorted(
         (each for each in found if each.photographs >= _MIN_ROWS or each.problem), key=lambda each: -each.photographs
     )
+
+
+def _count(names: Sequence[str], rows: Sequence[GpsRow], file: Path) -> int:
+    """Of how many photographs rows are."""
+    with suppress(CaptureError):
+        return len(match_rows(names, rows, file))
+    return 0
 
 
 def track_notes(folders: Iterable[Path]) -> list[str]:

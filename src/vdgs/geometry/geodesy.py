@@ -7,6 +7,8 @@ import numpy as np
 #: WGS 84 ellipsoid: semi-major axis in metres and flattening.
 SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1 / 298.257223563
+#: No camera of a survey is higher, or lower, in metres (choice).
+HIGHEST_M = 20_000.0
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
@@ -34,6 +36,14 @@ def geodetic_from_ecef(ecef: np.ndarray) -> np.ndarray:
     # This form of the altitude stays exact at the poles, where horizontal / cos(latitude) does not.
     altitude = horizontal * np.cos(latitude) + z * sine - normal * (1 - ECCENTRICITY2 * sine**2)
     return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], axis=1)
+
+
+def is_earth_centered(places: np.ndarray) -> bool:
+    """Whether coordinates [n, 3] in metres can be nothing but Earth-centred ones of places where cameras are: near the
+    ellipsoid, and farther from the equator than z is high in a projected system."""
+    if not np.isfinite(places).all() or np.abs(places[:, 2]).min(initial=np.inf) < HIGHEST_M:
+        return False
+    return bool((np.abs(geodetic_from_ecef(places)[:, 2]) < HIGHEST_M).all())
 
 
 def median_place(geodetic: np.ndarray) -> tuple[float, float, float]:

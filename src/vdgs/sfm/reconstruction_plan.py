@@ -99,7 +99,7 @@ def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[Sfm
         notes.append(f"{points.name} beside the photographs is not used. To use it: --gcp {shell_word(points)}")
     if request.gps is not None or options.georeference == "off":
         return request, notes
-    tables = position_tables(folders, [photo.name for photo in collection.images])
+    tables = position_tables(folders, [photo.name for photo in collection.images], without_system=True)
     placed, number = sum(photo.lat_lon is not None for photo in collection.images), len(collection.images)
     used = next((table for table in tables if table.photographs and table.file.name.lower() == ODM_POSITIONS), None)
     if used is not None and placed < MIN_POSITIONS:

@@ -11,11 +11,12 @@ import json
 from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vdgs.captures.coordinate_systems import ToGeodetic, to_geodetic
 from vdgs.captures.formats.json_poses import parse_number, parse_vector, read_capture_json
@@ -26,7 +27,7 @@ from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.crs import utm_epsg
-from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import rotation_about
 from vdgs.system.documents import JsonObject
 
@@ -38,8 +39,8 @@ _HEAD_BYTES = 2048
 #: Positions that are told twice differ by less (about a metre on Earth, and in one system).
 _SAME_PLACE_DEG, _SAME_PLACE_M = 1e-5, 0.01
 _AGAIN = "Export it again."
-#: What other lists of cameras hold: what vdgs writes, and the cameras of a trained 3DGS scene.
-_OTHER_LISTS = (b"matrix_world", b'"img_name"')
+#: What other lists of cameras hold: what vdgs writes, the cameras of a trained 3DGS scene, and UAVScenes.
+_OTHER_LISTS = (b"matrix_world", b'"img_name"', b'"OriginalImageName"')
 _UNDISTORT = "Undistort the photographs (opensfm undistort), and give the undistorted folder"
 #: COLMAP's model of each projection, and its distortion in COLMAP's order; with one focal length or two.
 _ONE_FOCAL = {"perspective": ("RADIAL", ("k1", "k2")), "fisheye": ("RADIAL_FISHEYE", ("k1", "k2"))}
@@ -60,8 +61,8 @@ def find_files(root: Path) -> list[Path]:
 
 
 def is_file(file: Path) -> bool:
-    """Whether a file is a reconstruction, which is a list (the file of this name that vdgs writes itself is not, and
-    the cameras of a trained 3DGS scene are no reconstruction), or the report of an ODM project."""
+    """Whether a file is a reconstruction, which is a list, as others are that are none (`_OTHER_LISTS`), or the report
+    of an ODM project."""
     if file.suffix not in (".json", ".geojson"):
         return False
     try:
@@ -84,55 +85,106 @@ def _read_reconstruction(file: Path) -> Project:
     views, refused = _views(reconstruction, _read_cameras(reconstruction.get("cameras"), file), file)
     points, colors = _points(reconstruction, file)
     views = _with_tracks(views, list(reconstruction.get("points") or ()), file.parent / TRACKS)
-    system, place = _system(reconstruction, file)
+    system, place = _system(reconstruction, file, warnings)
     return Project(
         format="opensfm", file=file, views=views, points=points, colors=colors, to_geodetic=system, place=place,
         warnings=tuple(warnings), refused=refused, remedy=_UNDISTORT,
     )  # fmt: skip
 
 
-def _system(reconstruction: JsonObject, file: Path) -> tuple[ToGeodetic | None, str]:
+def _system(reconstruction: JsonObject, file: Path, warnings: list[str]) -> tuple[ToGeodetic | None, str]:
     """What brings the world to latitude, longitude and height, and words about it."""
-    of_undistorted = (file.parent.parent / TOPOCENTRIC).is_file()
-    project = file.parents[2] if of_undistorted else file.parent.parent
-    coordinates = project / "odm_georeferencing" / "coords.txt"
-    if file.name != TOPOCENTRIC and coordinates.is_file():
-        shift, system, place = _offset_system(coordinates)
-        if of_undistorted or _is_shifted(reconstruction, project, shift):
-            return system, place
+    folder = file.parent.parent if (file.parent.parent / TOPOCENTRIC).is_file() else file.parent
     origin = _reference(reconstruction, file.parent)
-    if origin is None:
-        return None, ""
-    return lambda points: geodetic_from_enu(points, origin), "OpenSfM, metres about its reference"
+    enu = None if origin is None else (lambda points: geodetic_from_enu(points, origin))
+    found = (each / "odm_georeferencing" / "coords.txt" for each in folder.parents[:2])
+    coordinates = next((each for each in found if each.is_file()), None)
+    if file.name != TOPOCENTRIC and coordinates is not None:
+        offset = _read_offset(coordinates)
+        if folder != file.parent or _is_shifted(reconstruction, file, offset, enu, warnings):
+            return offset.to_geodetic, offset.place
+    return enu, "OpenSfM, metres about its reference" if enu is not None else ""
 
 
-def _offset_system(file: Path) -> tuple[np.ndarray, ToGeodetic, str]:
-    """The offset and the system that coords.txt of an ODM project tells."""
+@dataclass(frozen=True, eq=False)
+class _Offset:
+    """What coords.txt of an ODM project tells: the system, what ODM takes off its coordinates, and where the
+    photographs were taken by their GPS [n, 3], in the system without the offset."""
+
+    file: Path
+    shift: np.ndarray
+    to_geodetic: ToGeodetic
+    place: str
+    positions: np.ndarray
+
+
+def _read_offset(file: Path) -> _Offset:
     try:
-        header, offset = file.read_text(encoding="utf-8-sig").split("\n")[:2]
+        header, offset, *lines = file.read_text(encoding="utf-8-sig").split("\n")
         shift = np.array([*map(float, offset.split()), 0.0])
+        positions = np.array([[float(word) for word in line.split()] for line in lines if line.strip()])
     except (OSError, ValueError):
-        shift, header = np.zeros(0), ""
+        shift, positions, header = np.zeros(0), np.zeros(0), ""
     if shift.shape != (3,) or not np.isfinite(shift).all():
         raise CaptureError(f"{file}: must hold a system and an offset of two numbers. Copy it from the project again.")
     change, name = to_geodetic(header, file)
-    return shift, lambda points: change(points + shift), f"ODM, {name}"
+    known = positions if positions.ndim == 2 and positions.shape[1] == 3 else np.zeros((0, 3))
+    return _Offset(file, shift, lambda points: change(points + shift), f"ODM, {name}", known)
 
 
-def _is_shifted(reconstruction: JsonObject, project: Path, shift: np.ndarray) -> bool:
-    """Whether an ODM project that has lost its topocentric reconstruction has this one in UTM: as its report has it."""
-    report = project / "odm_report" / REPORT
+def _is_shifted(
+    reconstruction: JsonObject, file: Path, offset: _Offset, enu: ToGeodetic | None, warnings: list[str]
+) -> bool:
+    """Whether an ODM project that has lost its topocentric reconstruction has this one in UTM: by its report, else by
+    the GPS of its photographs; a warning where nothing tells."""
+    report = offset.file.parent.parent / "odm_report" / REPORT
     content = read_capture_json(report) if report.is_file() else {}
     for feature in content.get("features") or ():
         told = feature.get("properties", {}) if isinstance(feature, dict) else {}
         shot = reconstruction["shots"].get(told.get("filename"))
         if isinstance(shot, dict):
-            turn, move, place = (
-                parse_vector(value, 3, report, "a photograph")
-                for value in (shot.get("rotation"), shot.get("translation"), told.get("translation"))
-            )
-            return bool(np.abs(-rotation_about(turn).T @ move + shift - place).max() < _SAME_PLACE_M)
-    return False
+            place = parse_vector(told.get("translation"), 3, report, "a photograph")
+            return bool(np.abs(_center(shot, report) + offset.shift - place).max() < _SAME_PLACE_M)
+    if enu is None:
+        return False
+    nearer = _is_nearer_in_utm(reconstruction, offset, enu, file)
+    if nearer is None:
+        warnings.append(
+            f"{RECONSTRUCTION} of an ODM project may be in {offset.place.removeprefix('ODM, ')} or in metres about "
+            f"{REFERENCE}, and nothing tells which: it is taken for the latter. Copy {TOPOCENTRIC} or odm_report/"
+            f"{REPORT} of the project beside it, or give the place: --gps TABLE."
+        )
+    return bool(nearer)
+
+
+def _is_nearer_in_utm(reconstruction: JsonObject, offset: _Offset, enu: ToGeodetic, file: Path) -> bool | None:
+    """Whether the cameras are nearer to the GPS of their photographs (which shots have in metres about the reference,
+    coords.txt of all photographs in UTM) if they are in UTM; None where neither file has these."""
+    shots = [shot for shot in reconstruction["shots"].values() if isinstance(shot, dict)]
+    told = [shot for shot in shots if any(shot.get("gps_position") or ())]
+    if not shots or not (told or len(offset.positions)):
+        return None
+    centers = np.array([_center(shot, file) for shot in told or shots])
+    if told:
+        gps = enu(np.array([parse_vector(shot["gps_position"], 3, file, "'gps_position'") for shot in told]))
+    else:
+        gps = offset.to_geodetic(offset.positions)
+    origin = median_place(gps)
+    known = enu_from_geodetic(gps, origin)
+
+    def squares_away(system: ToGeodetic) -> float:
+        places = enu_from_geodetic(system(centers), origin)
+        away = np.linalg.norm(places - known, axis=1) if told else cKDTree(known).query(places)[0]
+        return float((away**2).sum())
+
+    return squares_away(offset.to_geodetic) < squares_away(enu)
+
+
+def _center(shot: JsonObject, file: Path) -> np.ndarray:
+    """Where a camera is."""
+    keys = ("rotation", "translation")
+    turn, move = (parse_vector(shot.get(key), 3, file, f"{key!r} of a photograph") for key in keys)
+    return -rotation_about(turn).T @ move
 
 
 def _biggest(file: Path) -> tuple[JsonObject, list[str]]:

@@ -51,10 +51,11 @@ def find_photographs(
     if sizes is not None:
         found = [name or _of_size(each, size, images) for name, each, size in zip(found, meant, sizes, strict=True)]
     unclear = [each for name, each in zip(found, meant, strict=True) if name is None and len(each) > 1]
-    _refuse_many_unclear(unclear, len(names) - found.count(None), len(names), file)
+    alike = [each for each, count in Counter(names).items() if count > 1]
+    _refuse_many_unclear(unclear, len(names) - found.count(None), len(names), alike, file)
     if not any(found):
         raise _none_there(names, folder, images, file)
-    _refuse_shared(found, file)
+    _refuse_shared(found, alike, file)
     chosen = [name for name, each in zip(found, meant, strict=True) if name is not None and len(each) > 1]
     notes = _notes_on_several(unclear, chosen, folder)
     called = [name or _plain(each[0]) for name, each in zip(found, names, strict=True)]
@@ -72,13 +73,27 @@ def _none_there(names: Sequence[tuple[str, ...]], folder: Path, images: dict[str
     )
 
 
-def _refuse_shared(found: Sequence[str | None], file: Path) -> None:
+def _names_of_their_own(alike: Sequence[tuple[str, ...]]) -> str:
+    """What to do where a project has the same names for several cameras, which no choice of a folder tells apart."""
+    shown = ", ".join(each[0] for each in alike[:3]) + (", ..." if len(alike) > 3 else "")
+    return (
+        f"The project itself has one name for several of its photographs ({shown}): give all photographs names of "
+        "their own, align them under these, and export it again (of Metashape, give the .psx, or put the cameras into "
+        "groups that are called as the folders)."
+    )
+
+
+def _refuse_shared(found: Sequence[str | None], alike: Sequence[tuple[str, ...]], file: Path) -> None:
     """Raise `CaptureError` for photographs that were found for several cameras."""
     twice = sorted(name for name, count in Counter(filter(None, found)).items() if count > 1)
     if twice:
+        remedy = (
+            "Photographs of one name need their folders, on disk and in the project: give the folder above them with "
+            "--images."
+        )
         raise CaptureError(
-            f"{file}: several of its cameras mean the same photograph: {', '.join(twice[:10])}. Photographs of one "
-            "name need their folders, on disk and in the project: give the folder above them with --images."
+            f"{file}: several of its cameras mean the same photograph: {', '.join(twice[:10])}. "
+            f"{_names_of_their_own(alike) if alike else remedy}"
         )
 
 
@@ -103,15 +118,18 @@ def _of_size(names: Sequence[str], size: tuple[int, int], images: dict[str, Path
     return fitting[0] if len(fitting) == 1 else None
 
 
-def _refuse_many_unclear(unclear: Sequence[Sequence[str]], found: int, count: int, file: Path) -> None:
+def _refuse_many_unclear(
+    unclear: Sequence[Sequence[str]], found: int, count: int, alike: Sequence[tuple[str, ...]], file: Path
+) -> None:
     """Raise `CaptureError` where photographs would be enough if it were known which of several they are."""
     if not unclear or not found < LEAST_THERE * count <= found + len(unclear):
         return
     apart = all(len({PurePosixPath(name).parent for name in each}) > 1 for each in unclear)
-    remedy = "choose the folder of one with --images" if apart else "keep only one of each there"
+    remedy = f"Of these {'choose the folder of one with --images' if apart else 'keep only one of each there'}."
     raise CaptureError(
         f"{file}: {len(unclear)} of its {count} names may be of several photographs each: "
-        f"{_either(unclear[:3])}{', ...' if len(unclear) > 3 else ''}. Of these {remedy}."
+        f"{_either(unclear[:3])}{', ...' if len(unclear) > 3 else ''}. "
+        f"{_names_of_their_own(alike) if alike else remedy}"
     )
 
 

@@ -31,12 +31,16 @@ from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import geodetic_from_ecef, is_earth_centered
 from vdgs.system.units import first_names
 
 #: Columns that say where a camera is; with them a table is one of registered cameras.
 _POSE = ("x", "y", "alt", "heading", "pitch", "roll")
 _MATRIX = ("tx", "ty", "tz", *(f"r{row}{column}" for row in range(3) for column in range(3)))
 _LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+#: Columns of the focal length, and all that are read: a row that ends before one of them is cut.
+_FOCAL = {"f", "fpix"}
+_READ = {"name", *_FOCAL, "pxpix", "pypix", *_POSE, *_MATRIX, *_LENS}
 #: What people's own templates call the columns.
 _ALIASES = {
     "file": "name", "filename": "name", "image": "name", "imagename": "name", "label": "name",
@@ -94,8 +98,9 @@ class RegisteredCamera:
 
 
 def find_files(root: Path) -> list[Path]:
-    """The tables of registered cameras in a folder; else the first XMP beside its photographs, for all of them."""
-    tables = [file for file in sorted(root.glob("*.csv")) if _is_table(file)]
+    """The tables of registered cameras in a folder, without those of positions and angles alone; else the first XMP
+    beside its photographs, for all of them."""
+    tables = [file for file in sorted(root.glob("*.csv")) if _is_table(file, with_lens=True)]
     beside = (file for folder in (root, root / "images") for file in _xmp_below(folder, folder != root))
     return tables or [file for file in islice(beside, _XMP_LOOKED_AT) if _is_xmp(file)][:1]
 
@@ -189,6 +194,8 @@ def _world(views: tuple[ProjectView, ...], file: Path) -> tuple[ToGeodetic | Non
     if middle[:2].max() > _PROJECTED_FROM:
         if (named := _named_system(file)) is not None:
             return named[0], False, True, f"RealityScan, {named[1]}"
+        if is_earth_centered(centers):
+            return geodetic_from_ecef, False, True, "RealityScan, Earth-centred metres, taken as of WGS 84"
         return None, False, True, "RealityScan, metres of a projected system that it does not name"
     return None, False, False, ""
 
@@ -211,14 +218,15 @@ def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
     return None
 
 
-def _is_table(file: Path) -> bool:
-    """Whether a file begins with the columns of registered cameras."""
+def _is_table(file: Path, *, with_lens: bool = False) -> bool:
+    """Whether a file begins with the columns of registered cameras, their focal lengths among them or not."""
     try:
         with file.open("rb") as stream:
             head = decode_text(stream.read(_HEAD_BYTES))
     except OSError:
         return False
-    return any(_column_names(line) is not None for line in head.splitlines()[:3])
+    found = [columns for columns in map(_column_names, head.splitlines()[:3]) if columns is not None]
+    return any(not with_lens or not _FOCAL.isdisjoint(names) for _, names in found)
 
 
 def _column_names(line: str) -> tuple[str, list[str]] | None:
@@ -247,9 +255,10 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
     if found is None:
         raise CaptureError(f"{file}: names no columns name, {', '.join(_POSE)}. {_AGAIN}")
     delimiter, names = found
-    if not {"f", "fpix"} & {*names}:
+    if _FOCAL.isdisjoint(names):
         raise CaptureError(
-            f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead."
+            f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead; a table "
+            "of positions is given beside the photographs, as --gps."
         )
     cameras, problems = [], []
     rows = csv.reader(io.StringIO("\n".join(lines[start + 1 :])), delimiter=delimiter)
@@ -257,8 +266,10 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
         if not "".join(row).strip() or row[0].startswith("#"):
             continue
         try:
+            if missing := [name for name in names[len(row) :] if name in _READ]:
+                raise ValueError(f"ends before {', '.join(missing)}")
             cameras.append(_row_camera(dict(zip(names, row, strict=False)), delimiter, file))
-        except (KeyError, ValueError) as error:
+        except ValueError as error:
             problems.append(f"line {number}: {error}")
     if problems:
         listed = "".join(f"\n  {each}" for each in problems[:10])
@@ -272,7 +283,7 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
 
 
 def _row_camera(row: dict[str, str], delimiter: str, file: Path) -> RegisteredCamera:
-    """Raises ValueError, or KeyError for a row that ends too early."""
+    """Raises ValueError for what is no number."""
 
     def number(key: str) -> float:
         value = float(row[key].replace(",", ".") if delimiter == ";" else row[key])
