@@ -66,6 +66,18 @@ def test_a_rigid_motion_and_scaling_of_the_world_changes_only_the_yaw(tmp_path_f
     assert turn.scale == pytest.approx(1, abs=1e-9)
 
 
+def test_up_that_the_reconstruction_of_a_capture_tells_is_not_estimated(tmp_path):
+    """Level at a wall looks like straight down on ground; attitudes told it when the capture was made."""
+    scene = moved(tiny_scene(), 0.3, Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.zeros(3))
+    assert ground_of(scene, tmp_path)[0].rotation[2, 2] < 0.1
+    (tmp_path / "reconstruction.json").write_text(json.dumps({"up": "the recorded attitudes"}))
+    frame, _ = ground_of(scene, tmp_path)
+    assert frame.rotation == pytest.approx(np.eye(3))
+    assert "up by the recorded attitudes" in frame.description
+    assert not frame.metric
+    assert ground_of(scene, tmp_path, up="y")[0].rotation[2] == pytest.approx([0, 1, 0])
+
+
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_the_estimated_up_axis_is_up(tmp_path_factory, seed):

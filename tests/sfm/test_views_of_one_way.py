@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vdgs.errors import CaptureError
+from vdgs.sfm.georeferencing import _upright
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration, georegister
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
@@ -122,6 +123,18 @@ def test_positions_along_a_line_are_not_called_exchanged_by_chance(seed):
     for turn in np.radians([0, 30, 60, 90]):
         turned = positions.enu @ Rotation.from_rotvec([0, 0, turn]).as_matrix().T
         georegister(model, photographs, replace(positions, enu=turned))
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_recorded_attitudes_tell_up_where_no_positions_place_a_model(recorded):
+    model, photographs, _ = taken_from(before_a_wall(), wall(), (0.0, 0.0), recorded=recorded)
+    turns = []
+    model.transform = turns.append
+    placed = _upright(model, photographs, AlignmentFailure("no positions that can be used", ""))
+    assert placed.up == ("the recorded attitudes" if recorded else "")
+    assert len(turns) == recorded
+    for turn in turns:
+        assert turn.rotation.matrix() @ TURN @ [0, 0, 1] == pytest.approx([0, 0, 1], abs=0.02)
 
 
 def test_mirrored_positions_of_a_wall_are_refused_all_the_same():

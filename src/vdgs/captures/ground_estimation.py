@@ -34,7 +34,7 @@ from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
-from vdgs.captures.reconstruction import by_axis
+from vdgs.captures.reconstruction import by_axis, told_up
 from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.up_axis import HINT, estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
@@ -129,7 +129,11 @@ def _frame_without_distances(
         frame = _promised(scene, source.world, warnings)
         _compare_up(scene, frame, warnings)
         return frame, warnings
-    up, how = estimate_up(scene.centers, scene.rotations, scene.points, warnings)
+    told = told_up(root)
+    if told:
+        up, how = np.array([0.0, 0.0, 1.0]), f"up by {told}"
+    else:
+        up, how = estimate_up(scene.centers, scene.rotations, scene.points, warnings)
     if not options.gps:
         tables = position_tables((root, root / source.images), scene.names)
         warnings += [table_note(table, len(scene.names)) for table in tables]

@@ -146,6 +146,8 @@ class ReconstructionReport:
     """Surveyed points, those that placed the model and those held out."""
     accuracy: AccuracyFacts | None = None
     """Of the place; None where there is none."""
+    up: str = ""
+    """By what z is up in a world without metres; empty where nothing tells, and for worlds with metres."""
     flown: tuple[str, ...] = ()
     """When the first and the last photograph were taken, as EXIF has it; empty where it says nothing."""
 
@@ -193,6 +195,12 @@ def read_reconstruction(root: Path) -> ReconstructionReport | None:
         return record_from_dict(ReconstructionReport, read_json(file))
     except ValueError as error:
         raise CaptureError(f"{file}: is damaged ({error}). Remove it to do without.") from error
+
+
+def told_up(root: Path) -> str:
+    """By what z is up in a capture that was made of photographs here and has no metres; empty where nothing tells."""
+    told = read_json_or_empty(root / RECONSTRUCTION_FILE).get("up")
+    return told if isinstance(told, str) else ""
 
 
 def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
-from vdgs.sfm.up_direction import model_points, up_of
+from vdgs.sfm.up_direction import BY_ATTITUDES, model_points, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 
 WITHOUT = (
@@ -76,7 +77,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
             georegistration.transform_model(model, placed.similarity)
             model, placed = _bent(model, placed, prepared, hold_focal)
     if isinstance(placed, AlignmentFailure):
-        return Georeferenced(model, placed, None, (), photographs, notes)
+        return Georeferenced(model, _upright(model, photographs, placed), None, (), photographs, notes)
     survey: tuple[GcpReport, ...] = ()
     if control is not None and placed.is_georeferenced:
         survey = gcp_adjustment.measure_gcps(
@@ -89,6 +90,17 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     altitude = altitude + ground if _knows_altitude(prepared, placed) else 0.0
     origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
     return Georeferenced(model, placed, origin, survey, photographs, notes)
+
+
+def _upright(
+    model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata], failure: AlignmentFailure
+) -> AlignmentFailure:
+    """Turn a model that nothing brings to metres so that z is up, where recorded attitudes tell that."""
+    up, _ = up_of(model, photographs)
+    if up.how != BY_ATTITUDES:
+        return failure
+    georegistration.transform_model(model, Similarity(1.0, rotation_to_z(up.direction), np.zeros(3)))
+    return replace(failure, up=up.how)
 
 
 def _knows_altitude(prepared: ReconstructionPlan, placed: Georegistration) -> bool:

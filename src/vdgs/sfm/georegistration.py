@@ -76,6 +76,8 @@ class AlignmentFailure:
 
     reason: str
     remedy: str
+    up: str = ""
+    """By what its z is up all the same; empty where nothing tells."""
 
 
 def georegister(

@@ -28,6 +28,8 @@ from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.up_direction import model_points, tilt_from_attitudes
 from vdgs.system.lazy_pycolmap import pycolmap
 
+#: What nothing tells of a model without positions, attitudes and surveyed points.
+UNKNOWN = "scale, north and up are not known"
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
@@ -79,15 +81,16 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     if any(photo.sensor for photo in collection.images):
         warnings += describe_rigs(model, "m" if metric else "units of the model")
     advice = _advice(look, held[0], len(images), sum(photo.face != "up" for photo in collection.images))
-    if isinstance(result.found.placed, AlignmentFailure):
-        unplaced = result.found.placed
-        georeferenced = f"none: {unplaced.reason}; scale, north and up are not known"
+    unplaced = result.found.placed if isinstance(result.found.placed, AlignmentFailure) else None
+    if unplaced is not None:
+        rest = f"scale and north are not known, z is up by {unplaced.up}" if unplaced.up else UNKNOWN
+        georeferenced = f"none: {unplaced.reason}; {rest}"
         warnings.append(
             f"not georeferenced ({unplaced.reason}): the scale of the scene is arbitrary. To mend it, {unplaced.remedy}"
         )
-    else:
-        georeferenced = result.found.placed.method
-        warnings += result.found.placed.notes
+    elif placed is not None:
+        georeferenced = placed.method
+        warnings += placed.notes
     return ReconstructionReport(
         found=len(collection.images) + len(collection.excluded), registered=len(images),
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
@@ -102,6 +105,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         advice=tuple(advice),
         seconds=result.seconds,
         survey=result.found.survey, accuracy=placed.accuracy if placed else None,
+        up=unplaced.up if unplaced is not None else "",
         flown=first_and_last(photo.datetime for photo in collection.images),
     )  # fmt: skip
 

@@ -13,6 +13,8 @@ from vdgs.sfm.attitude_tilt import tilt_of_attitudes
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.lazy_pycolmap import pycolmap
 
+#: How up is found where it is by what the drone recorded.
+BY_ATTITUDES = "the recorded attitudes"
 #: Attitudes that agree on which way a world lies, at least.
 MIN_ATTITUDES = 3
 #: Recorded attitudes that scatter by more (degrees, median), or that differ so far from what the views say, and by so
@@ -63,7 +65,7 @@ def _up_by_attitudes(rotations: np.ndarray, down: np.ndarray, views: Up) -> tupl
     doubt, wrong = LOOKED_UP if apart > 90 else "", int((~agree).sum())
     many = wrong >= WRONG_ATTITUDES * len(down)
     notes = [f"{wrong} of {len(down)} recorded attitudes contradict the others, and are not used."] if many else []
-    return Up(found / np.linalg.norm(found), deviation, "the recorded attitudes", doubt=doubt), notes
+    return Up(found / np.linalg.norm(found), deviation, BY_ATTITUDES, doubt=doubt), notes
 
 
 def tilt_from_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) -> float | None:
