@@ -114,6 +114,17 @@ def test_cameras_that_are_held_level_say_what_is_up(scene, within):
         assert warnings == []
 
 
+def test_a_hand_held_walk_before_a_wall_and_its_ground_is_level():
+    """Least variance lies between both; nobody rolls a camera as much as that axis asks for."""
+    walk = np.column_stack([np.linspace(-9, 9, 16), np.full(16, -7.0), np.full(16, 1.6)])
+    yaws = -1.2 * walk[:, 0] + 8 * np.sin(walk[:, 0])
+    points = np.concatenate([box((-20, 20), (-0.1, 0.1), (0, 9)), box((-20, 20), (-20, 0), (-0.1, 0.1), count=100)])
+    for turn in turns():
+        angle, warnings = off_by((*cameras(walk, yaws, -2.0, (2, 0, 1)), points), turn)
+        assert angle < 3
+        assert any("up is taken from their upper sides" in each for each in warnings)
+
+
 @pytest.mark.parametrize("yaw", [0.0, [90.0, 270.0] * 12], ids=["ahead", "both sides"])
 def test_a_street_seen_one_way_has_an_up_that_is_off_by_the_pitch_and_says_so(yaw):
     """Houses stand close, so that across is the flat axis, along which nobody holds the bottom of a camera."""

@@ -108,6 +108,16 @@ def test_flights_straight_over_a_slope_with_the_top_of_photographs_uphill_are_no
     assert placed.similarity.scale == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.parametrize("pitch_deg", [35.0, 60.0])
+def test_cameras_that_look_up_under_a_bridge_are_not_mirrored(pitch_deg):
+    """They look like cameras straight over a slope; recorded attitudes tell."""
+    places = np.array([[x, y, 2.0 + 0.1 * x] for y in (-3.0, 0.0, 3.0) for x in np.arange(-9.0, 10, 3)])
+    deck = np.random.default_rng(2).uniform([-30, -8, 8.9], [30, 8, 9.1], (400, 3))
+    placed = georegister(*taken_from(places, deck, (90.0, pitch_deg), wrong_m=0.1, recorded=True))
+    assert isinstance(placed, Georegistration)
+    assert up_off_deg(placed) < 6
+
+
 def test_positions_that_do_not_spread_are_no_scale():
     """Straight up along a tower, with one altitude recorded: any drift of it would explain any scale."""
     rise = np.stack([np.full(13, 22.0), np.full(13, 3.0), np.arange(4.0, 30, 2)], axis=1)

@@ -29,8 +29,9 @@ MIN_SIDES_PRODUCT = 0.4
 #: Nobody rolls cameras by so much (squared sine, mean): an axis that asks for it is not up (choice). Right vectors that
 #: spread by less are parallel; they fit a hillside too, so that only an axis along them is ruled out.
 MAX_ROLL, MAX_ROLL_PARALLEL = float(np.sin(np.radians(10.0))) ** 2, 0.5
-#: An axis is clearly the better up if it asks for less than this share of the other's roll (choice).
-MAX_ROLL_RATIO = 0.25
+#: An axis is clearly the better up if it asks for less than this share of the other's roll, where that is more than of
+#: hands (squared sine; choice).
+MAX_ROLL_RATIO, CLEAR_ROLL = 0.25, float(np.sin(np.radians(2.5))) ** 2
 #: Roll for which right vectors count as much as the mean image-up does: where they spread by less, that decides.
 ROLL_PRIOR = 0.002
 #: Views whose mean is so long look down alike; it agrees with the shape of the flight within so many degrees (choice).
@@ -47,6 +48,10 @@ UPPER_SIDES = "upper sides of the photographs up"
 #: What may be taken for what where photographs all look one way.
 OR_WALL = (
     "all photographs look the same way with the same side up: straight down on ground, or level at a wall. Taken for "
+    "down"
+)
+OR_CEILING = (
+    "all photographs look the same way with the same side up: straight down on a slope, or up at a ceiling. Taken for "
     "down"
 )
 OR_SLOPE = (
@@ -123,6 +128,9 @@ def _estimate(
             level = _level(views.rights, views.image_up)
             other = OtherUp(-level if level @ views.image_up < 0 else level, OR_WALL)
             warnings.append(f"{OR_WALL}; if it is a wall, {HINT}")
+        elif one_side and own * looking >= MIN_SIDES_PRODUCT:
+            other = OtherUp(-axis if own < 0 else axis, OR_CEILING)
+            warnings.append(f"{OR_CEILING}; if it is a ceiling, {HINT}")
         return (-axis if looking > 0 else axis), f"{how}, against the view", other
     above = float(np.median(centers @ axis) - np.median(points @ axis))
     warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
@@ -141,6 +149,9 @@ def _axis(views: _Views, centers: np.ndarray, points: np.ndarray, warnings: list
     axis, uncertain, how = _flight_axis(views, centers, points)
     neither = abs(views.forward @ axis) < MIN_VIEW_COSINE and abs(views.image_up @ axis) < MIN_UPRIGHT_COSINE
     rolled = _roll(views.rights, axis) > (MAX_ROLL_PARALLEL if views.parallel else MAX_ROLL)
+    changes = float(np.var(views.rights @ axis))  # of the roll: a hillside alone has all cameras rolled alike
+    if views.same_side and changes > CLEAR_ROLL:
+        rolled |= _roll(views.rights, _level(views.rights, views.image_up)) < MAX_ROLL_RATIO * changes
     if views.same_side and (neither or rolled or (uncertain and not views.parallel)):
         if views.parallel:
             warnings.append(
@@ -221,7 +232,7 @@ def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) 
         apart = float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1))))
         left = float(np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[1])
         doubt = min(_lean_deg(length, left), apart / 2) if left < TURNED else apart / 2
-        return UpByViews(mean, max(VIEWS_DEG, doubt), bool(up @ mean > 0), other)
+        return UpByViews(mean, max(VIEWS_DEG, doubt), other is None and bool(up @ mean > 0), other)
     one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
     middle = up + (1 if one_way else 2) * mean
     deviation = UNCERTAIN_DEG if doubts and one_way else VIEWS_DEG * (2 if one_way else 1)  # maybe level at a wall
