@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up
 from vdgs.captures.position_fit import fit_positions
-from vdgs.captures.up_axis import up_by_views
+from vdgs.captures.up_axis import VIEWS_DEG, up_by_views
 from vdgs.sfm.flights import altitude_offsets
 from vdgs.sfm.georegistration import _checked_on_a_line, accuracy_of
 from vdgs.sfm.gps_priors import GpsPriors
@@ -77,6 +77,20 @@ def test_a_slope_is_told_from_a_look_aside_by_cameras_that_turn():
     assert np.degrees(np.arccos(up[2])) < deviation <= 3
     up, deviation, *_ = up_by_views(places, one_way, ground)
     assert deviation > 5
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_views_that_are_exactly_parallel_lean_by_nothing(seed):
+    """Cameras that look one way and turn about that, back and forth over a slope: their mean is 1 but for rounding."""
+    rng = np.random.default_rng(seed)
+    places = along_a_slope()
+    ground = rng.uniform([-20, -20, 455], [70, 60, 456], (500, 3))
+    ground[:, 2] += np.tan(np.radians(22.0)) * ground[:, 1]
+    lean = Rotation.from_euler("x", rng.uniform(0, 3), degrees=True).as_matrix()
+    turns = [Rotation.from_euler("z", 180.0 * (k // 5 % 2) + seed, degrees=True).as_matrix() for k in range(20)]
+    up, deviation, *_ = up_by_views(places, np.array([turn @ NADIR @ lean for turn in turns]), ground)
+    assert up == pytest.approx(lean.T @ [0, 0, 1], abs=1e-9)
+    assert deviation == pytest.approx(VIEWS_DEG)
 
 
 def along_a_slope(climb_deg: float = 22.0) -> np.ndarray:

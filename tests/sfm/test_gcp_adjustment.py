@@ -287,11 +287,11 @@ def test_a_focal_length_that_altitudes_leave_open_is_fitted_where_the_model_show
     model = pycolmap.Reconstruction(made / "mapped")
     before = [camera.params.copy() for camera in model.cameras.values()]
     monkeypatch.setattr(incremental_mapper, "MIN_HEIGHT_SPREAD", spread)  # any height is another one
-    found = incremental_mapper.release_focal([model], (True, incremental_mapper.OF_FLIGHTS), 1)
+    found = incremental_mapper.release_focal([model], (True, incremental_mapper.OF_FLIGHTS), [], 1)
     assert found[0] is held
     after = [camera.params for camera in model.cameras.values()]
     assert np.array_equal(before, after) is held
-    assert incremental_mapper.release_focal([model], (False, "asked for"), 1) == (False, "asked for")
+    assert incremental_mapper.release_focal([model], (False, "asked for"), [], 1) == (False, "asked for")
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.6, 1.5])

@@ -154,7 +154,8 @@ def mapped(folder: Path, lost: str | None = None, shaken_m: float = 0.0, mixed: 
     incremental_mapper.run_mapper(workspace, 16, True, 1, CONSOLE)
     incremental_mapper.set_models_aside(workspace)
     map_rigs(workspace, images, 16, True, 1, console)
-    loose, model = (incremental_mapper.read_models(workspace, aside)[0] for aside in (True, False))
+    places = workspace.models_aside, workspace.models
+    loose, model = (incremental_mapper.read_models(workspace, place)[0] for place in places)
     return flight, len(poses), loose, model, " ".join(console.file.getvalue().split())
 
 

@@ -242,5 +242,5 @@ def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) 
 def _lean_deg(length: float, left: float) -> float:
     """By how much the mean view leans, in degrees, where cameras that are tilted alike turn about up: `length` is that
     of the mean of their unit views, `left` what is left of the mean of those across up (1: no turn, 0: all around)."""
-    across = float(np.sqrt((1 - length**2) / max(1 - left**2, 1e-9)))  # the sine of the tilt
+    across = float(np.sqrt(max(0.0, 1 - length**2) / max(1 - left**2, 1e-9)))  # the sine of the tilt
     return float(np.degrees(np.arctan2(left * across, np.sqrt(max(0.0, 1 - across**2)))))

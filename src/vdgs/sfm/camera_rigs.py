@@ -39,7 +39,7 @@ def map_rigs(
 ) -> None:
     """Make models again, with the cameras of rigs held together as those that were set aside have them; these are taken
     back, and why is said, where they fit the photographs better, or do not tell how the cameras lie."""
-    loose = incremental_mapper.read_models(workspace, aside=True)[0]
+    loose = incremental_mapper.read_models(workspace, workspace.models_aside)[0]
     before = pycolmap.Reconstruction(loose)  # joining changes the model
     why = "no two of them are placed together often enough, and fixed to each other"
     if _join_sensors(workspace, photographs, loose):

@@ -253,9 +253,14 @@ def _is_of_rig(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
     return bool(model.rigs[model.frames[image.frame_id].rig_id].num_sensors() > 1)
 
 
+def is_impossible(camera: pycolmap.Camera) -> bool:
+    """Whether there is no such lens."""
+    return not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0)
+
+
 def fitted_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     """The lens of a camera. Raises CaptureError for one that there is not."""
-    if not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0):
+    if is_impossible(camera):
         raise CaptureError(
             f"the fitted lens of a camera ({camera.params_to_string()}) is none that there is: the photographs do not "
             "tell it. Hold the focal length: --focal fixed"

@@ -32,6 +32,8 @@ def print_preflight(preflight: PreflightReport, collection: ImageList, plan: lis
         rows.append(("Flying height", f"{preflight.height_m:.1f} m {preflight.height_from}"))
     if preflight.gsd_m is not None:
         rows.append(("A pixel shows", f"about {100 * preflight.gsd_m:.1f} cm of the ground"))
+    elif not preflight.shows_ground:
+        rows += _rows_of_level_views(preflight)
     if preflight.forward_overlap is not None and preflight.views_per_point is not None:
         seen = f"a place is seen by about {preflight.views_per_point:.0f}"
         rows.append(
@@ -76,6 +78,15 @@ def _images_text(preflight: PreflightReport, collection: ImageList) -> str:
     left_out = f", {len(collection.excluded)} left out" if collection.excluded else ""
     others = f", {collection.other_files} other files beside them" if collection.other_files else ""
     return f"{preflight.num_images}{left_out}{others}"
+
+
+def _rows_of_level_views(preflight: PreflightReport) -> list[tuple[str, str]]:
+    """What is known of photographs that show no ground."""
+    look = f"level or up: {preflight.tilt_deg:.0f}° from straight down (median)"
+    rows = [("Views", f"{look}; nothing says how far away what they show is, nor how far they overlap")]
+    if preflight.pixel_rad is not None:
+        rows.append(("A pixel shows", f"about {100 * 10 * preflight.pixel_rad:.2g} cm of what is 10 m away"))
+    return rows
 
 
 def _masks_text(preflight: PreflightReport) -> str:

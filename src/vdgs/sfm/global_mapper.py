@@ -67,7 +67,7 @@ def place_left_out(workspace: Workspace, count: int, fix_focal: bool, threads: i
 
     Raises VdgsError for a full disk, and where the process of the global mapper cannot start.
     """
-    parts = incremental_mapper.read_models(workspace, aside=True)
+    parts = incremental_mapper.read_models(workspace, workspace.models_aside)
     try:
         why = _map_globally(workspace, count, len(placed_images(parts[0])), fix_focal, threads, console)
         if not why:

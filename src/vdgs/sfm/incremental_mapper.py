@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_
 from vdgs.captures.odd_positions import places_apart
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
-from vdgs.sfm.capture_writer import placed_images
+from vdgs.sfm.capture_writer import is_impossible, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
@@ -33,9 +34,12 @@ MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
 MIN_FOR_SLOPE = 8
 #: Why a focal length is held until the model shows whether it can be fitted: `release_focal`.
 OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
-#: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`.
+#: Why it is fitted then.
+OF_SHAPE = "several heights or views, as the photographs themselves show, which tell it"
+#: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
 ASKED = "asked for"
 CONTRADICTED = "held at what one tag alone says of it, the photographs fit together plainly worse"
+CONFIRMED = "tags that agree say it, and the photographs cannot tell it: fitted, it went astray"
 #: A fitted focal length contradicts the held one where points lie nearer to where they are seen by this share (choice),
 #: and the two are no one value as tags go (`AGREE`). Over ground that does not tell it neither is so.
 CLEARLY_NEARER = 0.05
@@ -134,9 +138,12 @@ def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np
     return np.asarray(heights - terms @ np.linalg.lstsq(terms, heights, rcond=None)[0])
 
 
-def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str], threads: int) -> tuple[bool, str]:
+def release_focal(
+    models: list[pycolmap.Reconstruction], held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
+) -> tuple[bool, str]:
     """Fit the focal length of the first of models, where it was held for OF_FLIGHTS but the photographs alone show that
-    they were taken from several heights or look several ways. Whether it is held then, and why."""
+    they were taken from several heights or look several ways, unless it goes astray. Whether it is held then, and
+    why."""
     if held != (True, OF_FLIGHTS):
         return held
     model = models[0]
@@ -147,8 +154,12 @@ def release_focal(models: list[pycolmap.Reconstruction], held: tuple[bool, str],
     oblique = np.mean(views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG)))
     if _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE:
         return True, "level strips, as the photographs themselves show, whatever their altitudes say"
+    as_held = pycolmap.Reconstruction(model)
     _fit_focal(model, threads)
-    return False, "several heights or views, as the photographs themselves show, which tell it"
+    if is_astray(model, (False, OF_SHAPE), groups) and is_held_as_good([as_held], models):
+        models[0] = as_held
+        return True, CONFIRMED
+    return False, OF_SHAPE
 
 
 def is_contradicted(
@@ -157,7 +168,7 @@ def is_contradicted(
     """Whether the focal length of a model was held at what one tag alone says, and the photographs plainly say another:
     programs that shrink photographs rewrite what tags count from."""
     said = {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
-    if not held[0] or held[1] == ASKED or not said:
+    if not held[0] or held[1] in (ASKED, CONFIRMED) or not said:
         return False
     fitted = pycolmap.Reconstruction(model)
     fitted.update_point_3d_errors()
@@ -167,6 +178,38 @@ def is_contradicted(
     return nearer >= CLEARLY_NEARER and any(
         not alike(fitted.cameras[k].mean_focal_length(), focal) for k, focal in said.items() if k in fitted.cameras
     )
+
+
+def is_astray(model: pycolmap.Reconstruction, held: tuple[bool, str], groups: Sequence[CameraGroup]) -> bool:
+    """Whether the focal length of a model was fitted and is none that there is, or far from what tags that confirm each
+    other say: depth and focal length stretch together, from any number of heights, where views are parallel to well
+    below a degree, and where they climb along a tower."""
+    placed = Counter(image.camera_id for image in placed_images(model))
+    said = {k: group.focal_px for k, group in enumerate(groups, 1) if k in placed and _is_confirmed(group)}
+    few = max(1, FEW * placed.total())
+    if held[0] or held[1] == ASKED or not said or sum(n for k, n in placed.items() if k not in said) > few:
+        return False
+    return any(is_impossible(model.cameras[k]) for k in placed) or any(
+        not alike(model.cameras[k].mean_focal_length(), focal) for k, focal in said.items()
+    )
+
+
+def _is_confirmed(group: CameraGroup) -> bool:
+    doubted = any(photo.lens and photo.lens.doubt for photo in group.images)
+    return group.has_focal_prior and group.is_confirmed and not doubted
+
+
+def is_held_as_good(held: Sequence[pycolmap.Reconstruction], fitted: Sequence[pycolmap.Reconstruction]) -> bool:
+    """Whether models with the focal length held are to be taken in place of those where it went astray (the largest
+    first, errors computed): they place as many photographs, whose points do not lie plainly farther from where they are
+    seen; or the fitted lens is none that there is."""
+    if not held:
+        return False
+    if any(is_impossible(fitted[0].cameras[image.camera_id]) for image in placed_images(fitted[0])):
+        return True
+    placed, before = len(placed_images(held[0])), len(placed_images(fitted[0]))
+    allowed = (1 + CLEARLY_NEARER) * mean_reprojection_error(fitted[0])
+    return placed >= before and mean_reprojection_error(held[0]) <= allowed
 
 
 def _fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
@@ -293,11 +336,12 @@ def registered_count(folder: Path) -> int:
         return int.from_bytes(file.read(8), "little")
 
 
-def set_models_aside(workspace: Workspace) -> None:
-    """Keep the models of a first run of the mapper, for `read_models` and `take_models_back`. They stay where they are
-    until the next run begins, for the work may stop in between."""
-    shutil.rmtree(workspace.models_aside, ignore_errors=True)
-    shutil.copytree(workspace.models, workspace.models_aside)
+def set_models_aside(workspace: Workspace, place: Path | None = None) -> None:
+    """Keep the models of a first run of the mapper, for `read_models` and `take_models_back`, or in another place. They
+    stay where they are until the next run begins, for the work may stop in between."""
+    place = place or workspace.models_aside
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(workspace.models, place)
     for folder in (workspace.snapshots, workspace.saved_snapshots):
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -307,10 +351,10 @@ def take_models_back(workspace: Workspace) -> None:
     shutil.copytree(workspace.models_aside, workspace.models)
 
 
-def read_models(workspace: Workspace, aside: bool = False) -> list[pycolmap.Reconstruction]:
-    """What `run_mapper` found, the model of most photographs first."""
-    place = workspace.models_aside if aside else workspace.models
-    models = [pycolmap.Reconstruction(folder) for folder in sorted(place.iterdir()) if folder.is_dir()]
+def read_models(workspace: Workspace, place: Path | None = None) -> list[pycolmap.Reconstruction]:
+    """What `run_mapper` found, or what was set aside in a place, the model of most photographs first."""
+    folders = sorted((place or workspace.models).iterdir())
+    models = [pycolmap.Reconstruction(folder) for folder in folders if folder.is_dir()]
     for model in models:
         drop_unseen_observations(model)
     return sorted(models, key=lambda model: -model.num_reg_images())

@@ -31,6 +31,9 @@ MIN_POSITIONED = 0.9
 RTK_M = 0.2
 #: Views farther from straight down than this are oblique (degrees).
 OBLIQUE_ANGLE_DEG = 20.0
+#: Views that look less down than this (degrees from straight down; median) show walls: neither the flying height nor
+#: the height over the median point is how far away what they show is (choice).
+LEVEL_TILT_DEG = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,22 +58,34 @@ class PreflightReport:
     """Whether all these are as accurate as with corrections."""
     height_m: float | None
     height_from: str
+    tilt_deg: float | None
+    """Median of the recorded angles between views and straight down; None where no photograph says."""
+    pixel_rad: float | None
+    """What a pixel in the middle shows, in metres for each metre that it is away."""
     gsd_m: float | None
+    """Metres that such a pixel shows, were the ground level; this and what follows are None for level views."""
     forward_overlap: float | None
     views_per_point: float | None
-    """By how many photographs a place is seen, were the ground level and all views straight down."""
+    """By how many photographs a place is seen, were the ground level and all views as far from straight down."""
     oblique: int | None
     """Views farther than `OBLIQUE_ANGLE_DEG` from straight down; None where no photograph says."""
     days: list[str]
     warnings: list[str]
+
+    @property
+    def shows_ground(self) -> bool:
+        """Whether the flying height tells how far away what the photographs show is, as far as is recorded."""
+        return _shows_ground(self.tilt_deg)
 
 
 def make_preflight_report(collection: ImageList, positions: GpsPriors) -> PreflightReport:
     """All that can be said without decoding pixels."""
     photographs = collection.images
     height, height_from = flying_height(photographs)
-    footprint = _footprint(photographs, height)
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
+    tilt, pixel = _median(tilts), _pixel_rad(photographs)
+    away = _distance_of_ground(height, tilt)
+    footprint = _footprint(photographs, away)
     days = sorted({f"{when:%Y-%m-%d}" for when in _moments(photographs)})
     accuracies = [max(photo.gps_std[:2]) for photo in photographs if photo.gps_std is not None]
     # What positions tell of the flight needs those of nearly all photographs.
@@ -87,8 +102,8 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
         altitude_reference=positions.altitude_reference,
         accurate=len(accuracies),
         rtk=bool(accuracies) and max(accuracies) < RTK_M,
-        height_m=height, height_from=height_from,
-        gsd_m=_ground_sampling(photographs, height),
+        height_m=height, height_from=height_from, tilt_deg=tilt, pixel_rad=pixel,
+        gsd_m=away * pixel if away and pixel else None,
         forward_overlap=overlap, views_per_point=views,
         oblique=sum(tilt > OBLIQUE_ANGLE_DEG for tilt in tilts) if tilts else None,
         days=days,
@@ -114,10 +129,21 @@ def _spread(positions: GpsPriors) -> tuple[float, float] | None:
     return float(east), float(north)
 
 
-def _ground_sampling(photographs: Sequence[ImageMetadata], height: float | None) -> float | None:
-    """Metres of level ground that a pixel shows in a view straight down."""
+def _shows_ground(tilt_deg: float | None) -> bool:
+    """Whether views of this median tilt look down, for all that is known."""
+    return tilt_deg is None or tilt_deg <= LEVEL_TILT_DEG
+
+
+def _distance_of_ground(height: float | None, tilt_deg: float | None) -> float | None:
+    """Metres along the view to level ground so far below; None where views do not look down."""
+    if height is None or not _shows_ground(tilt_deg):
+        return None
+    return height / float(np.cos(np.radians(tilt_deg or 0.0)))
+
+
+def _pixel_rad(photographs: Sequence[ImageMetadata]) -> float | None:
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
-    return height / focal if height and focal else None
+    return 1 / focal if focal else None
 
 
 def _median(values: object) -> float | None:
@@ -125,11 +151,12 @@ def _median(values: object) -> float | None:
     return statistics.median(found) if found else None
 
 
-def _footprint(photographs: Sequence[ImageMetadata], height: float | None) -> tuple[float, float] | None:
-    """Longer and shorter side in metres of what a view straight down shows of level ground."""
+def _footprint(photographs: Sequence[ImageMetadata], away: float | None) -> tuple[float, float] | None:
+    """Longer and shorter side in metres of what a view shows, square to it, of ground so many metres away: of level
+    ground an oblique view shows more."""
     focal = _median(photo.lens.focal for photo in photographs if photo.lens)
     shape = _median(min(photo.width, photo.height) / max(photo.width, photo.height) for photo in photographs)
-    return None if not height or not focal or not shape else (height / focal, height / focal * shape)
+    return None if not away or not focal or not shape else (away / focal, away / focal * shape)
 
 
 def _overlap(

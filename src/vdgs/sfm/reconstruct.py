@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
 from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
@@ -26,7 +27,7 @@ from vdgs.captures.reconstruction import (
 )
 from vdgs.config.serialization import to_dict
 from vdgs.config.sfm_options import SfmRequest
-from vdgs.errors import VdgsError
+from vdgs.errors import CaptureError, VdgsError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm import (
     capture_writer,
@@ -349,22 +350,44 @@ def _mapped(
     count: int,
     console: Console,
 ) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
-    """The models, and whether the focal length was held and why; anew where the first show that it must not be."""
-    held = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)
-    anew = f"{key}, focal length fitted"
-    if not workspace.is_begun("model", anew):
-        models = _models(plan, workspace, key, count, held[0], console)
-        held = incremental_mapper.release_focal(models, held, plan.threads)
+    """The models, and whether the focal length was held and why; anew where the first show that it must not be, or
+    must be."""
+    meant = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)
+    fitting, holding = f"{key}, focal length fitted", f"{key}, focal length held"
+    if not any(workspace.is_begun("model", anew) for anew in (fitting, holding)):
+        models = _models(plan, workspace, key, count, meant[0], console)
+        held = incremental_mapper.release_focal(models, meant, kinds, plan.threads)
         if workspace.is_done("focal", key):
             return models, held
-        if not incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
+        if incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
+            why = "the photographs contradict the focal length that is held; it is fitted, all anew"
+        elif not meant[0] and incremental_mapper.is_astray(models[0], held, kinds):
+            why = "the fitted focal length is far from what tags that agree say; it is held, all anew"
+            incremental_mapper.set_models_aside(workspace, workspace.models_fitted)
+        else:
             workspace.finish("focal", key)
             return models, held
-        console.print(
-            "[yellow]note[/] the photographs contradict the focal length that is held; it is fitted, all anew",
-            highlight=False,
-        )
-    return _models(plan, workspace, anew, count, False, console), (False, incremental_mapper.CONTRADICTED)
+        console.print(f"[yellow]note[/] {why}", highlight=False)
+    if not meant[0]:
+        return _held_anew(plan, workspace, holding, count, meant, console)
+    return _models(plan, workspace, fitting, count, False, console), (False, incremental_mapper.CONTRADICTED)
+
+
+def _held_anew(
+    plan: ReconstructionPlan, workspace: Workspace, key: str, count: int, meant: tuple[bool, str], console: Console
+) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
+    """Models with the focal length held, and why it is; where these are worse, those that were set aside, for which it
+    was `meant` to be fitted."""
+    try:
+        models = _models(plan, workspace, key, count, True, console)
+    except CaptureError as error:  # none can be made
+        models = []
+        console.print(f"[yellow]note[/] with the focal length held: {escape(str(error))}", highlight=False)
+    fitted = incremental_mapper.read_models(workspace, workspace.models_fitted)
+    if incremental_mapper.is_held_as_good(models, fitted):
+        return models, (True, incremental_mapper.CONFIRMED)
+    console.print("[yellow]note[/] held, the photographs fit together worse; it stays fitted", highlight=False)
+    return fitted, meant
 
 
 def _models(

@@ -22,7 +22,13 @@ from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
-from vdgs.sfm.preflight import MIN_OVERLAP, MIN_VIEWS_PER_POINT, OBLIQUE_ANGLE_DEG, PreflightReport
+from vdgs.sfm.preflight import (
+    LEVEL_TILT_DEG,
+    MIN_OVERLAP,
+    MIN_VIEWS_PER_POINT,
+    OBLIQUE_ANGLE_DEG,
+    PreflightReport,
+)
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.up_direction import model_points, tilt_from_attitudes
@@ -34,9 +40,6 @@ UNKNOWN = "scale, north and up are not known"
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 MAX_TILT_DEG = 3.0
-#: Views that look less down than this (degrees from straight down; median) show walls: the height of the median point
-#: is not that of the ground (choice).
-LEVEL_TILT_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

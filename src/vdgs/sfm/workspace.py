@@ -85,6 +85,11 @@ class Workspace:
         return self.path / "loose"
 
     @property
+    def models_fitted(self) -> Path:
+        """Models whose focal length was fitted, while others are made with it held."""
+        return self.path / "fitted"
+
+    @property
     def snapshots(self) -> Path:
         """Where the mapper writes what it has from time to time; whole only once it goes on."""
         return self.path / "snapshots"
