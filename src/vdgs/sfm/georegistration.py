@@ -111,7 +111,6 @@ def georegister(
         has_altitudes=positions.has_altitudes,
     )
     problem, in_doubt = with_likelier_up(problem)
-    notes += [f"{in_doubt}. If that is wrong, up is off by a right angle: {ADVICE_UP}"] if in_doubt else []
     up = problem.up
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
@@ -136,13 +135,12 @@ def georegister(
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
         return AlignmentFailure(refused, ADVICE_BETTER_POSITIONS)
-    notes += [f"{refused}; used all the same, as asked for."] if refused else []
-    notes += [f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else []
+    notes += _of_doubts(in_doubt, refused, wrong)
     notes += _of_elsewhere(fit, elsewhere, fit.similarity.scale * far)
     notes += _of_offsets(offsets, fit) if offsets is not None else []
     notes += [_over_ground(fit)] if over_ground else _of_altitudes(fit, barometer)
     notes += of_reading + of_line + of_north + list(filter(None, [weighing_note(fit.deviations, fit.inliers)]))
-    accuracy = accuracy_of(fit, positions, offsets)
+    accuracy = accuracy_of(fit, positions, offsets, in_doubt)
     return Georegistration(
         similarity=fit.similarity,
         method=_method(fit, barometer, on_a_line, positions.source, up.how),
@@ -151,9 +149,16 @@ def georegister(
         residuals=_recorded(fit.placed - levelled.targets, positions),
         inliers=fit.inliers,
         deviations=fit.deviations,
-        accuracy=replace(accuracy, level_deg=max(accuracy.level_deg or 0.0, 90.0)) if in_doubt else accuracy,
+        accuracy=accuracy,
         notes=tuple(notes),
     )
+
+
+def _of_doubts(in_doubt: str, refused: str, wrong: str) -> list[str]:
+    """What up is in doubt of, and what of the positions would be refused had they not been asked for."""
+    notes = [f"{in_doubt}. If that is wrong, up is off by a right angle: {ADVICE_UP}"] if in_doubt else []
+    notes += [f"{refused}; used all the same, as asked for."] if refused else []
+    return notes + ([f"the positions fit only once {wrong}; used all the same, as asked for."] if wrong else [])
 
 
 def _deviations(positions: GpsPriors, rows: np.ndarray, stated: bool) -> tuple[np.ndarray, bool]:
@@ -185,13 +190,17 @@ def _recorded(values: np.ndarray, positions: GpsPriors) -> np.ndarray:
     return values if positions.has_altitudes else values[..., :2]
 
 
-def accuracy_of(fit: PositionFit, positions: GpsPriors, offsets: AltitudeOffsets | None = None) -> AccuracyFacts:
-    """The accuracy of a fit, for people; the edge of the flight is where photographs are, not stray positions."""
+def accuracy_of(
+    fit: PositionFit, positions: GpsPriors, offsets: AltitudeOffsets | None = None, in_doubt: str = ""
+) -> AccuracyFacts:
+    """The accuracy of a fit, for people; the edge of the flight is where photographs are, not stray positions. Where up
+    is `in_doubt` it may be off by a right angle."""
     place = fit.place_error_m if positions.has_altitudes else fit.place_error_m[:1]
     away = np.linalg.norm(fit.placed[:, :2] - fit.placed[:, :2].mean(axis=0), axis=1)
     return AccuracyFacts(
         place_m=place, scale_percent=100 * fit.scale_error, scale_m=float(fit.scale_error * away.max()),
-        north_deg=min(180.0, fit.north_error_deg), level_deg=min(180.0, fit.level_error_deg),
+        north_deg=min(180.0, fit.north_error_deg),
+        level_deg=min(180.0, max(fit.level_error_deg, 90.0 if in_doubt else 0.0)),
         positions_m=tuple(_recorded(fit.gps_std, positions).tolist()),
         altitude=fit.altitude if positions.has_altitudes else "none", altitude_drift_m=fit.drift_m,
         altitude_offsets_m=tuple(offsets.different) if offsets is not None else (),

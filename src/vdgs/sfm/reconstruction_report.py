@@ -84,16 +84,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     if any(photo.sensor for photo in collection.images):
         warnings += describe_rigs(model, "m" if metric else "units of the model")
     advice = _advice(look, held[0], len(images), sum(photo.face != "up" for photo in collection.images))
-    unplaced = result.found.placed if isinstance(result.found.placed, AlignmentFailure) else None
-    if unplaced is not None:
-        rest = f"scale and north are not known, z is up by {unplaced.up}" if unplaced.up else UNKNOWN
-        georeferenced = f"none: {unplaced.reason}; {rest}"
-        warnings.append(
-            f"not georeferenced ({unplaced.reason}): the scale of the scene is arbitrary. To mend it, {unplaced.remedy}"
-        )
-    elif placed is not None:
-        georeferenced = placed.method
-        warnings += placed.notes
+    georeferenced, up_by, of_place = _words_of_place(result.found.placed)
     return ReconstructionReport(
         found=len(collection.images) + len(collection.excluded), registered=len(images),
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
@@ -104,13 +95,22 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
         focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
-        photographs=_photographs(collection, positions, placed, result.excluded), warnings=tuple(warnings),
+        photographs=_photographs(collection, positions, placed, result.excluded), warnings=(*warnings, *of_place),
         advice=tuple(advice),
         seconds=result.seconds,
         survey=result.found.survey, accuracy=placed.accuracy if placed else None,
-        up=unplaced.up if unplaced is not None else "",
+        up=up_by,
         flown=first_and_last(photo.datetime for photo in collection.images),
     )  # fmt: skip
+
+
+def _words_of_place(placed: Georegistration | AlignmentFailure) -> tuple[str, str, tuple[str, ...]]:
+    """How the model was brought to metres, or why not; by what z is up where it was not; and what to know of it."""
+    if isinstance(placed, Georegistration):
+        return placed.method, "", placed.notes
+    rest = f"scale and north are not known, z is up by {placed.up}" if placed.up else UNKNOWN
+    note = f"not georeferenced ({placed.reason}): the scale of the scene is arbitrary. To mend it, {placed.remedy}"
+    return f"none: {placed.reason}; {rest}", placed.up, (note,)
 
 
 def exclusion_reasons(

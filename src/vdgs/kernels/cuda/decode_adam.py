@@ -41,21 +41,10 @@ def decode_backward_adam(
     anchor whose gradient is not finite does not move. `lr_boost` is the same for all of `moved`. Raises ValueError or
     TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
-    check_updates(updates, len(positions))
-    check_indices(rows, len(positions))
+    _check_arguments(positions, moved, weights, rows, gradients, updates)
     features, offsets, _ = moved
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
-    parts = [getattr(state, name) for name in ("parameter", "first", "second") for state in moved]
-    check_anchor_shapes(positions, *parts[: len(moved)])
-    check_decoder(k, weights, (positions, *parts))
-    if any(not state.parameter.shape == state.first.shape == state.second.shape for state in moved):
-        raise ValueError("parameter and moments must be of one shape")
-    if len({state.lr_boost for state in moved}) > 1:
-        raise ValueError("features, offsets and log-scales must be annealed alike")
-    check_splat_gradients(gradients)
-    incoming = (gradients.means_px, gradients.conics, gradients.colors, gradients.opacities, gradients.depths)
-    if any(t is not None and t.dtype != torch.float32 for t in incoming):
-        raise TypeError("gradients of splats must be float32")
+    parts, incoming = _parts(moved), _incoming(gradients)
     v, device, source = len(rows), positions.device, gradients.source
     shown = source if isinstance(source, SplatMask) else SplatMask.of(source, v, k)
     lacking, roots = bias_correction_tables(0.9, 0.999, device, torch.float32)
@@ -87,6 +76,33 @@ def decode_backward_adam(
     if wanted and not sums:  # nothing is visible
         return finite, tuple(torch.zeros_like(t) for t in weights.tensors())
     return finite, _of_heads(sums, k) if wanted else None
+
+
+def _check_arguments(
+    positions: Tensor, moved: Sequence[AdamState], weights: DecoderWeights, rows: Tensor, gradients: SplatGradients,
+    updates: Tensor,
+) -> None:  # fmt: skip
+    check_updates(updates, len(positions))
+    check_indices(rows, len(positions))
+    parts = _parts(moved)
+    check_anchor_shapes(positions, *parts[: len(moved)])
+    check_decoder(moved[1].parameter.shape[1], weights, (positions, *parts))
+    if any(not state.parameter.shape == state.first.shape == state.second.shape for state in moved):
+        raise ValueError("parameter and moments must be of one shape")
+    if len({state.lr_boost for state in moved}) > 1:
+        raise ValueError("features, offsets and log-scales must be annealed alike")
+    check_splat_gradients(gradients)
+    if any(t is not None and t.dtype != torch.float32 for t in _incoming(gradients)):
+        raise TypeError("gradients of splats must be float32")
+
+
+def _parts(moved: Sequence[AdamState]) -> list[Tensor]:
+    """Parameters, first and second moments, each of all."""
+    return [getattr(state, name) for name in ("parameter", "first", "second") for state in moved]
+
+
+def _incoming(gradients: SplatGradients) -> tuple[Tensor | None, ...]:
+    return gradients.means_px, gradients.conics, gradients.colors, gradients.opacities, gradients.depths
 
 
 def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
