@@ -32,6 +32,8 @@ MAX_ROLL, MAX_ROLL_PARALLEL = float(np.sin(np.radians(10.0))) ** 2, 0.5
 #: An axis is clearly the better up if it asks for less than this share of the other's roll, where that is more than of
 #: hands (squared sine; choice).
 MAX_ROLL_RATIO, CLEAR_ROLL = 0.25, float(np.sin(np.radians(2.5))) ** 2
+#: Directions with a larger cosine are near each other (choice).
+NEAR_COSINE = 0.9
 #: Roll for which right vectors count as much as the mean image-up does: where they spread by less, that decides.
 ROLL_PRIOR = 0.002
 #: Views whose mean is so long look down alike; it agrees with the shape of the flight within so many degrees (choice).
@@ -53,6 +55,10 @@ OR_WALL = (
 OR_CEILING = (
     "all photographs look the same way with the same side up: straight down on a slope, or up at a ceiling. Taken for "
     "down"
+)
+OR_LEVEL = (
+    "all photographs have the same side up and are rolled less if that is up: down from a plane that rolls, or level "
+    "at a wall and its ground. Taken for the plane"
 )
 OR_SLOPE = (
     "all photographs look the same way with the same side up: up at a ceiling, or straight down on a steep slope. "
@@ -115,26 +121,34 @@ def _estimate(
     """What `estimate_up` gives, and what else up may be."""
     axis, how = _axis(views, centers, points, warnings)
     own, looking = float(views.image_up @ axis), float(views.forward @ axis)
-    one_side = views.same_side and views.parallel and not _turn_about(axis, views.rights, views.image_up)
+    other = _other_up(views, axis)
+    warnings += [f"{other.doubt}; if that is wrong, {HINT}"] if other is not None else []
     if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
-        other = None
-        if one_side and own * looking >= MIN_SIDES_PRODUCT:
-            other = OtherUp(-views.forward / np.linalg.norm(views.forward), OR_SLOPE)
-            warnings.append(f"{OR_SLOPE}; if it is a slope, {HINT}")
         return (-axis if own < 0 else axis), f"{how}, {UPPER_SIDES}", other
     if abs(looking) >= MIN_VIEW_COSINE:
-        other = None
-        if one_side and 2 * abs(own) < abs(looking):
-            level = _level(views.rights, views.image_up)
-            other = OtherUp(-level if level @ views.image_up < 0 else level, OR_WALL)
-            warnings.append(f"{OR_WALL}; if it is a wall, {HINT}")
-        elif one_side and own * looking >= MIN_SIDES_PRODUCT:
-            other = OtherUp(-axis if own < 0 else axis, OR_CEILING)
-            warnings.append(f"{OR_CEILING}; if it is a ceiling, {HINT}")
         return (-axis if looking > 0 else axis), f"{how}, against the view", other
     above = float(np.median(centers @ axis) - np.median(points @ axis))
     warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
     return (-axis if above < 0 else axis), f"{how}, cameras above", None
+
+
+def _other_up(views: _Views, axis: np.ndarray) -> OtherUp | None:
+    """What else up may be than an axis, of the sign that `_estimate` gives it: of photographs with one side up."""
+    own, looking = float(views.image_up @ axis), float(views.forward @ axis)
+    if not views.same_side or max(abs(own) / MIN_UPRIGHT_COSINE, abs(looking) / MIN_VIEW_COSINE) < 1:
+        return None
+    level = _level(views.rights, views.image_up)
+    level = -level if level @ views.image_up < 0 else level
+    if _is_leveller(level, axis, views):
+        return OtherUp(level, OR_LEVEL)
+    if not views.parallel or _turn_about(axis, views.rights, views.image_up):
+        return None
+    if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
+        down = -views.forward / np.linalg.norm(views.forward)
+        return OtherUp(down, OR_SLOPE) if own * looking >= MIN_SIDES_PRODUCT else None
+    if 2 * abs(own) < abs(looking):
+        return OtherUp(level, OR_WALL)
+    return OtherUp(np.sign(own) * axis, OR_CEILING) if own * looking >= MIN_SIDES_PRODUCT else None
 
 
 def _views(rotations: np.ndarray) -> _Views:
@@ -149,9 +163,6 @@ def _axis(views: _Views, centers: np.ndarray, points: np.ndarray, warnings: list
     axis, uncertain, how = _flight_axis(views, centers, points)
     neither = abs(views.forward @ axis) < MIN_VIEW_COSINE and abs(views.image_up @ axis) < MIN_UPRIGHT_COSINE
     rolled = _roll(views.rights, axis) > (MAX_ROLL_PARALLEL if views.parallel else MAX_ROLL)
-    changes = float(np.var(views.rights @ axis))  # of the roll: a hillside alone has all cameras rolled alike
-    if views.same_side and changes > CLEAR_ROLL:
-        rolled |= _roll(views.rights, _level(views.rights, views.image_up)) < MAX_ROLL_RATIO * changes
     if views.same_side and (neither or rolled or (uncertain and not views.parallel)):
         if views.parallel:
             warnings.append(
@@ -202,6 +213,16 @@ def _shape(points: np.ndarray) -> np.ndarray:
 def _roll(rights: np.ndarray, up: np.ndarray) -> float:
     """Mean squared sine of the angle by which cameras with these right vectors [n, 3] are rolled if `up` is up."""
     return float(((rights @ up) ** 2).mean())
+
+
+def _is_leveller(level: np.ndarray, axis: np.ndarray, views: _Views) -> bool:
+    """Whether cameras are rolled clearly less about their mean image-up than about an axis: before a wall and its
+    ground the axis of least variance lies between both. A strip of a plane that rolls has the same geometry."""
+    mean = views.image_up / np.linalg.norm(views.image_up)
+    if level @ mean < NEAR_COSINE or abs(level @ axis) > NEAR_COSINE:
+        return False
+    changes = float(np.var(views.rights @ axis))  # of the roll: on a hillside alone all cameras are rolled alike
+    return changes > CLEAR_ROLL and _roll(views.rights, level) < MAX_ROLL_RATIO * changes
 
 
 def _turn_about(axis: np.ndarray, rights: np.ndarray, image_up: np.ndarray) -> bool:
