@@ -9,6 +9,11 @@ TEST_STAMP = $(VENV)/.installed-test
 INSTALL = PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SOURCES = $(shell find src/vdgs/kernels/native src/vdgs/kernels/shared -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
 
+# Make and the shell would take its parts for folders of their own, and `make clean` remove each.
+ifneq ($(words $(VENV)),1)
+$(error VENV="$(VENV)" is empty or holds blanks: name a folder without them, or make a virtual environment there by hand and `pip install .` into it)
+endif
+
 # Threads of torch and numpy block instead of spinning beside the kernels' own.
 export OMP_WAIT_POLICY = PASSIVE
 export OPENBLAS_NUM_THREADS = 1

@@ -116,3 +116,11 @@ def test_a_mistake_is_found(tmp_path):
         "option --jobs of merge",
         "import vdgs.errors.Oops",
     ]
+
+
+def test_the_glossary_gives_options_that_there_are():
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `--[\w.-]+`(?: \(of vdgs (\w+)\))? \| `(--[\w.-]+)` \|$", text, re.M)
+    assert len(rows) > 90
+    everywhere = set().union(*FLAGS.values())
+    assert [new for verb, new in rows if new not in (FLAGS[verb] if verb else everywhere)] == []

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -15,9 +17,13 @@ from support.commands import PATIENCE_SECONDS
 from vdgs.cli.argument_parser import parse_words
 from vdgs.cli.main import COMMANDS, main, verb_arguments
 from vdgs.cli.run_cmd import RunArguments
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.options import Option, options_of
 from vdgs.config.output_paths import is_output
+from vdgs.config.presets import PRESETS
 from vdgs.errors import VdgsError
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import RunSettings
 
 #: A process that does what stands in the braces, and writes a file, as commands do.
 CODE = "import os, sys; from vdgs.system.exit_codes import exit_code_of; sys.exit(exit_code_of('vdgs', lambda: {}, ''))"
@@ -206,14 +212,76 @@ def test_output_that_nobody_can_take_is_no_traceback(words, where, says, buffere
     assert b"Exception" not in done.stderr
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "localhost:99999999"])
-def test_a_cluster_that_does_not_answer_is_not_waited_for(address):
-    """Ray tries for minutes."""
-    pytest.importorskip("ray")
-    from vdgs.distributed.ray_executor import check_reachable
+def refuse_to_start(**_: object) -> None:
+    pytest.fail("Ray is asked, and would try for minutes")
 
-    with pytest.raises(VdgsError, match="no Ray cluster that can be used"):
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "localhost:99999999", "no-host.invalid:6379"])
+def test_a_cluster_that_does_not_answer_is_not_waited_for(address, monkeypatch):
+    """Neither where a verb asks beforehand nor where one connects."""
+    ray = pytest.importorskip("ray")
+    from vdgs.distributed.ray_executor import check_reachable, connect
+
+    monkeypatch.setattr(ray, "init", refuse_to_start)
+    said = rf"^{address}: no Ray cluster that can be used.*ray status.*--address head:6379"
+    with pytest.raises(VdgsError, match=said):
         check_reachable(address)
+    with pytest.raises(VdgsError, match=said), connect(address):
+        pytest.fail("is connected")
+
+
+@pytest.mark.parametrize("answer", [b"", b"220 mail.example ESMTP ready\r\n"])
+def test_what_listens_and_is_no_cluster_is_not_waited_for(answer, monkeypatch):
+    ray = pytest.importorskip("ray")
+    from vdgs.distributed import ray_executor
+
+    monkeypatch.setattr(ray, "init", refuse_to_start)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            connection.recv(len(ray_executor.HTTP2_PREFACE), socket.MSG_WAITALL)
+            connection.sendall(answer)
+            connection.close()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with (
+            pytest.raises(VdgsError, match=f"what listens at {address} is no Ray"),
+            ray_executor.connect(address),
+        ):
+            pass
+        thread.join()
+
+
+def test_a_cluster_that_was_here_and_is_gone_is_not_waited_for(monkeypatch):
+    """What `auto` means then stands in a file that outlives the cluster."""
+    ray = pytest.importorskip("ray")
+    from vdgs.distributed import ray_executor
+
+    monkeypatch.setattr(ray, "init", refuse_to_start)
+    monkeypatch.setattr(ray_executor, "_address_on_record", lambda: "127.0.0.1:1")
+    with pytest.raises(VdgsError, match=r"^auto: no Ray cluster.*127\.0\.0\.1:1"), ray_executor.connect("auto"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("verb", "more"),
+    [("partition", []), ("train-blocks", []), ("eval", []), ("ortho", []), ("export", ["--output", "scene.ply"])],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_an_executor_that_is_not_there_is_refused_before_a_run_is_touched(verb, more, tmp_path, monkeypatch, capsys):
+    """Nor is a lock left in folders that the work would have filled."""
+    pytest.importorskip("ray")
+    write_colmap(tmp_path / "C", tiny_scene())
+    RunFolder(tmp_path / "run").create_or_check(RunSettings.create(tmp_path / "C", CaptureOptions(), PRESETS["laptop"]))
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")}
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main([verb, "run", *more, "--executor", "ray", "--address", "127.0.0.1:1"])
+    assert "127.0.0.1:1: no Ray cluster that can be used" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")} == before
 
 
 def test_a_ray_of_this_machine_that_does_not_start_is_told_in_words(monkeypatch):

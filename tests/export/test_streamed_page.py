@@ -11,14 +11,13 @@ from support.gaussians import random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import ExportScene
+from vdgs.export.formats.html import PAGE_LOSSES
 from vdgs.export.formats.streamed_page import write_streamed_page
 
 
 def test_the_leaves_hold_the_scene_and_nodes_above_fewer(tmp_path):
     some, path = random_gaussians(500, 0), tmp_path / "scene.json"
-    assert write_streamed_page(path, ExportScene.of(some), node_size=100) == (
-        "colors do not change with the viewing direction",
-    )
+    assert write_streamed_page(path, ExportScene.of(some), node_size=100) == PAGE_LOSSES
     scene = json.loads(path.read_text())
     leaves, waiting, count = [], [scene["root"]], 0
     while waiting:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 import vdgs
 from support.commands import CommandsHere, small_figures
@@ -148,7 +149,7 @@ def test_a_background_is_three_numbers_in_any_form(run):
 
 def test_an_appearance_that_is_not_there_is_named(run):
     camera = run.scene.cameras[0]
-    for wrong in (10**9, -1, "a", 0.5):
+    for wrong in (10**9, -1, "a", 0.5, len(run.scene.cameras)):
         with pytest.raises(VdgsError, match=f"^image_index is '?{wrong}'?; it must be"):
             vdgs.render(run.scene, camera, image_index=wrong)
     assert torch.equal(*(vdgs.render(run.scene, camera, image_index=each).rgb for each in (1, np.int64(1))))
@@ -205,7 +206,7 @@ def test_cameras_are_made_of_matrices(run):
     far = camera.camera_from_world.copy()
     far[0, 3] += 1e6 + 0.123  # in float32 the translation would be off by centimetres
     assert np.array_equal(vdgs.cameras_from(far[None], torch.tensor(K), 4, 3)[0].camera_from_world, far)
-    for poses, intrinsics in ((camera.camera_from_world, K), (far[None], K[0]), (far[None], np.stack([K, K]))):
+    for poses, intrinsics in ((camera.camera_from_world, K), (far[None], K[0]), (far[None], np.stack([K, K])), (1, 2)):
         with pytest.raises(ValueError, match="viewmats must be"):
             vdgs.cameras_from(poses, intrinsics, 4, 3)
 
@@ -380,6 +381,9 @@ def test_what_is_no_model_is_told_and_kept(run, native_small, tmp_path):
         with pytest.raises(VdgsError, match=rf"{name}: .*Give the model that Scene\.save or a run wrote") as said:
             vdgs.Scene.load(tmp_path / name)
         assert "elete" not in str(said.value)
+    save_file({"weight": torch.zeros(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(VdgsError, match=r"other\.safetensors: .*neither 'vdgs-anchors-1' nor 'vdgs-anchors-2'"):
+        vdgs.Scene.load(tmp_path / "other.safetensors")
     for folder in (native_small.capture, native_small.whole):
         with pytest.raises(VdgsError, match=r"is a folder, not a model\. vdgs\.open_run\(RUN\)\.scene"):
             vdgs.Scene.load(folder)
@@ -428,6 +432,7 @@ def test_what_does_not_work_is_said_before_any_work(capture, tmp_path):
 
 def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_path):
     points, counts = np.random.default_rng(0).uniform(0, 10, (300, 3)), np.full(300, 5)
+    one_lost = np.array([[0.0, 0.0, 0.0], [1.0, np.nan, 0.0]])
     for words, call in {
         r"AssignmentConfig\.threshold is 7\.0; it must be at least 0 and at most 1": lambda: vdgs.assign_cameras(
             run.scene, run.blocks, run.scene.cameras, vdgs.AssignmentConfig(threshold=7.0)
@@ -440,6 +445,10 @@ def test_an_option_that_does_not_work_is_named(run, capture, native_small, tmp_p
         "seed is -1; it must be at least 0": lambda: vdgs.partition(points, counts, seed=-1),
         "balanced is 'yes'; it must be true or false": lambda: vdgs.partition(points, counts, balanced="yes"),
         "points must be finite, and 300 of 300 are not": lambda: vdgs.partition(points * np.nan, counts),
+        "points must be finite, and 1 of 2 are not": lambda: vdgs.count_visibility(one_lost, run.scene.cameras),
+        "^points must be finite, and 1 of 2 are": lambda: vdgs.visibility_ratio(
+            torch.tensor(one_lost), run.scene.cameras
+        ),
         "points is empty": lambda: vdgs.partition(points[:0], counts[:0]),
         "^400 blocks: the scene has only 300 distinct anchors": lambda: vdgs.partition(points, counts, num_blocks=400),
         "visibility must be whole numbers of cameras": lambda: vdgs.partition(points, counts * np.nan),

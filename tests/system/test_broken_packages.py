@@ -13,6 +13,7 @@ import pytest
 
 from support.commands import PATIENCE_SECONDS
 from vdgs.cli.doctor import system_checks
+from vdgs.system.broken_packages import explain_shadows, shadowing_file
 from vdgs.system.exit_codes import exit_code_of
 
 NO_LIBRARY = "libtorch_cpu.so: cannot open shared object file: No such file or directory"
@@ -103,8 +104,10 @@ def test_faults_of_the_program_are_raised(error):
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", [["run", ".", "--output", "run"], ["doctor"]], ids=lambda words: words[0])
 def test_the_command_line_without_a_whole_torch(verb, tmp_path):
-    write_package(tmp_path, "torch", f"raise ImportError({NO_LIBRARY!r}, name='torch._C')")
-    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    installed = tmp_path / "site-packages"
+    installed.mkdir()
+    write_package(installed, "torch", f"raise ImportError({NO_LIBRARY!r}, name='torch._C')")
+    path = os.pathsep.join([str(installed), *filter(None, sys.path)])
     done = subprocess.run(
         [sys.executable, "-m", "vdgs", *verb], capture_output=True, text=True, cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": path}, timeout=PATIENCE_SECONDS, check=False,
@@ -113,3 +116,38 @@ def test_the_command_line_without_a_whole_torch(verb, tmp_path):
     assert "Traceback" not in done.stderr
     assert NO_LIBRARY in done.stdout + done.stderr
     assert "pip install --force-reinstall torch" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", [["run", ".", "--output", "run"], ["doctor"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("name", ["torch", "numpy", "yaml"])
+def test_a_file_of_a_package_s_name_in_the_current_folder_is_named(name, verb, tmp_path):
+    """Python looks there first. What is installed behind it is whole: to install it again mends nothing."""
+    (tmp_path / f"{name}.py").write_text("answer = 42\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "vdgs", *verb], capture_output=True, text=True, cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}, timeout=PATIENCE_SECONDS, check=False,
+    )  # fmt: skip
+    said = done.stdout + done.stderr
+    assert done.returncode == 1
+    assert "Traceback" not in said
+    assert f"{tmp_path / name}.py is taken for the package {name} and hides it: rename it or start vdgs in" in said
+    assert f"--force-reinstall {name}" not in said
+
+
+def test_only_a_package_that_lies_behind_another_is_hidden(tmp_path, monkeypatch):
+    """A package of one's own, and packages that are installed over those of Python or of the system, hide nothing."""
+    first, second = tmp_path / "first", tmp_path / "second" / "site-packages"
+    for folder in (first, second):
+        folder.mkdir(parents=True)
+        write_package(folder, "twice", "")
+    write_package(first, "once", "")
+    monkeypatch.setattr(sys, "path", [str(first), str(second), *sys.path])
+    assert shadowing_file("twice") == first / "twice"
+    assert shadowing_file("once") is None
+    assert shadowing_file("nowhere_at_all") is None
+    monkeypatch.setenv("PYTHONPATH", str(first))
+    assert "take its folder out of PYTHONPATH" in explain_shadows(["once", "twice"])
+    monkeypatch.setattr(sys, "path", [str(second), str(first), *sys.path[2:]])
+    assert shadowing_file("twice") is None
+    assert explain_shadows([*sys.stdlib_module_names, "torch", "numpy", "yaml"]) == ""

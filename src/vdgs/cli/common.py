@@ -58,10 +58,12 @@ class ShardArguments:
     executor_options: Annotated[ExecutorOptions, FlagName("")] = field(default_factory=ExecutorOptions)
 
     def execution(self, device: str) -> ExecutionOptions:
-        """Where the shards are done. Raises VdgsError for options that do not work."""
+        """Where the shards are done. Raises VdgsError, before anything is written, for options that do not work and an
+        executor that is not there."""
+        from vdgs.distributed.backend_selection import check_backend_reachable
         from vdgs.distributed.sharded_job import ExecutionOptions
 
-        self.executor_options.check()
+        check_backend_reachable(self.executor_options)
         return ExecutionOptions(self.executor_options, self.jobs, device=device)
 
 

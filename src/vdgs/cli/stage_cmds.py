@@ -101,10 +101,13 @@ def train_blocks_command(arguments: list[str]) -> None:
         TrainBlocksArguments, arguments, "train-blocks",
         lambda own: {"block_config": own.block},
     )  # fmt: skip
+    from vdgs.distributed.backend_selection import check_backend_reachable
     from vdgs.pipeline.train_block import train_block
     from vdgs.pipeline.train_blocks import train_blocks
     from vdgs.runs.run_context import RunContext
 
+    if args.block is None:
+        check_backend_reachable(args.executor_options)
     device = set_up_compute(args.device, 0 if args.block is None else args.threads)
     context, console = RunContext.from_path(args.run, args.capture), make_console(args.quiet)
     update_run_settings(run, replace(method, block=args.block_config), args.overwrite, console)

@@ -44,8 +44,11 @@ MAX_SOCKET_PATH_BYTES, SHORT_FOLDER = 107, "/tmp"
 LONGEST_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store"
 #: Seconds that a node gets to answer before anything starts.
 NODE_CHECK_TIMEOUT_SECONDS = 300.0
-#: Seconds that a cluster has to take a connection.
+#: Seconds that a cluster has to take a connection, and again to answer on it.
 KNOCK_SECONDS = 10.0
+#: What a client of gRPC says first, and how a server answers: with a frame that has a head of this length and kind.
+HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
+HTTP2_HEAD_BYTES, HTTP2_SETTINGS = 9, 4
 #: How often a node that does not answer any more is asked again, where Ray says that it may come back.
 MAX_UNAVAILABLE_POLLS = 20
 
@@ -116,22 +119,45 @@ def _token() -> str:
 def check_reachable(address: str | None) -> None:
     """Raises VdgsError where there is no Ray, or none that answers at that address. None is started for it."""
     _require_ray()
-    where = _resolve_address(address)
-    if where != "local":
-        _knock(where)
+    if _resolve_address(address) != "local":
         with connect(address):
             pass
 
 
 def _knock(where: str) -> None:
-    """Raise VdgsError where nothing listens at `host:port`: Ray itself would try it for minutes."""
-    host, _, port = where.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdecimal():  # `auto`
+    """Raise VdgsError where no gRPC server, which the head of a cluster is, answers at `where` within seconds: Ray
+    itself would try for many minutes, and hear no signal meanwhile."""
+    host, _, port = (_address_on_record() if where == "auto" else where.removeprefix("ray://")).rpartition(":")
+    if not host or not port.isdecimal():  # Ray names what it cannot read
         return
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK_SECONDS).close()
-    except (OSError, OverflowError) as error:
-        raise VdgsError(f"{where}: no Ray cluster that can be used ({error}). See `ray status` there.") from error
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK_SECONDS) as connection:
+            if os.environ.get("RAY_USE_TLS", "0").lower() in ("1", "true"):
+                return
+            connection.sendall(HTTP2_PREFACE)
+            answer = connection.recv(HTTP2_HEAD_BYTES, socket.MSG_WAITALL)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise _no_cluster(where, f"{host}:{port}: {error}" if where == "auto" else str(error)) from error
+    if len(answer) < HTTP2_HEAD_BYTES or answer[3] != HTTP2_SETTINGS:
+        raise _no_cluster(where, f"what listens at {host}:{port} is no Ray")
+
+
+def _address_on_record() -> str:
+    """The `host:port` that Ray takes for `auto`: of a cluster that runs here, or was joined here last and may be gone.
+    Empty where it finds none, or does not tell."""
+    with suppress(Exception):
+        from ray._private.services import canonicalize_bootstrap_address
+
+        return canonicalize_bootstrap_address("auto") or ""
+    return ""
+
+
+def _no_cluster(where: str, reason: str) -> VdgsError:
+    return VdgsError(
+        f"{where}: no Ray cluster that can be used ({reason}). See `ray status` there; give the address of its head "
+        "(--address head:6379) or, on one of its machines, --address auto, with the same versions of Ray and Python on "
+        "all."
+    )
 
 
 def _resolve_address(address: str | None) -> str:
@@ -149,14 +175,13 @@ def _ray_driver(where: str, options: Mapping[str, Any]) -> Iterator[None]:
     import ray
 
     with preserve_signal_handlers():
+        if where != "local":
+            _knock(where)
         try:
             ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **options)
         except Exception as error:  # Ray raises any: a node that is slow to start is a bare one
             message = str(error).strip().splitlines() or [type(error).__name__]
-            raise VdgsError(
-                f"{where}: no Ray cluster that can be used ({message[0]}). See `ray status` there; --address auto on "
-                "one of its machines, the same versions of Ray and Python on all."
-            ) from error
+            raise _no_cluster(where, message[0]) from error
     try:
         yield
     finally:

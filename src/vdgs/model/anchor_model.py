@@ -133,7 +133,10 @@ class AnchorModel:
         tensors, header = read_tensors(path, remedy)
         found = next((name for name in (ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT) if name in header), None)
         if found is None:
-            raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {ANCHOR_MODEL_FORMAT!r})")
+            raise VdgsError(
+                f"{path}: is not a vdgs anchor model (its header has neither {ANCHOR_MODEL_FORMAT!r} nor "
+                f"{MULTI_DECODER_FORMAT!r})"
+            )
         try:
             anchors = Anchors(
                 **{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED_TENSORS)},

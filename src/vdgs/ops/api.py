@@ -33,7 +33,7 @@ from vdgs.geometry.camera import Camera as Camera
 from vdgs.geometry.camera import check_camera, check_cameras
 from vdgs.kernels.device_selection import select_device
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.ops.arrays import Array, as_tensor, check_image_index, like
+from vdgs.ops.arrays import Array, as_tensor, check_finite_points, check_image_index, like
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
 from vdgs.runs import open_run as runs
@@ -236,7 +236,8 @@ def render(
     if mode not in ("rgb", "rgb+depth"):
         raise VdgsError(f"mode={mode!r}: choose rgb or rgb+depth")
     color = None if background is None else _checked_color("background", background)
-    index = check_image_index(image_index, (decoder for _, _, decoder in scene.model.decoder_ranges()))
+    num_images = MAX_COUNT if scene.capture is None else len(scene.capture.train_views)
+    index = check_image_index(image_index, (decoder for _, _, decoder in scene.model.decoder_ranges()), num_images)
     raster = draw(scene.model, camera, background=color, depth=mode != "rgb", image_index=index)
     if raster.depth is None or raster.median_depth is None:
         return Render(raster.image, raster.alpha, None, None)
@@ -254,23 +255,27 @@ def _checked_color(name: str, value: Any) -> tuple[float, float, float]:
 def count_visibility(points: Array, cameras: Sequence[Camera]) -> Array:
     """V_i [n] int32: how many cameras hold each point [n, 3] (float32 or float64) in their frustum. Nothing hides.
 
-    Raises TypeError or ValueError for other points. Source: VDGS section IV-B.
+    Raises TypeError or ValueError for other points, VdgsError for some that are not finite. Source: VDGS section IV-B.
     """
     from vdgs.visibility import visibility_counts
 
     check_cameras(cameras)
-    return like(points, visibility_counts.count_visibility(as_tensor("points", points), cameras))
+    places = as_tensor("points", points)
+    check_finite_points(places)
+    return like(points, visibility_counts.count_visibility(places, cameras))
 
 
 def visibility_ratio(points: Array, cameras: Sequence[Camera]) -> Array:
     """c_k [n] float32: the share of the distinct cameras whose frustum holds each point [n, 3].
 
-    Raises ValueError without cameras. Source: VDGS eq. 8.
+    Raises ValueError without cameras, VdgsError for points that are not finite. Source: VDGS eq. 8.
     """
     from vdgs.visibility import visibility_counts
 
     check_cameras(cameras)
-    return like(points, visibility_counts.visibility_ratio(as_tensor("points", points), cameras))
+    places = as_tensor("points", points)
+    check_finite_points(places)
+    return like(points, visibility_counts.visibility_ratio(places, cameras))
 
 
 def _checked_config(name: str, config: Any, *kinds: type, remedy: str = "") -> Any:
@@ -310,16 +315,13 @@ def partition(
         expansion=checked_value("expansion", expansion, hints["expansion"]),
     )
     seed = checked_value("seed", seed, field_hints(TrainConfig)["seed"])
-    places, counts = (
-        as_tensor(name, each).detach().cpu().numpy() for name, each in (("points", points), ("visibility", visibility))
-    )
+    given = as_tensor("points", points)
+    places, counts = (each.detach().cpu().numpy() for each in (given, as_tensor("visibility", visibility)))
     if places.ndim != 2 or places.shape[1] != 3 or counts.shape != places.shape[:1]:
         raise ValueError(f"points must be [n, 3] and visibility [n], not {places.shape} and {counts.shape}")
     if not len(places):
         raise VdgsError("points is empty: there is nothing to cut into blocks")
-    if not np.isfinite(places).all():
-        wrong = int((~np.isfinite(places)).any(axis=1).sum())
-        raise VdgsError(f"points must be finite, and {wrong} of {len(places)} are not: leave them out")
+    check_finite_points(given)
     if not (np.isfinite(counts) & (counts >= 0) & (counts <= MAX_COUNT) & (counts == np.floor(counts))).all():
         raise VdgsError("visibility must be whole numbers of cameras, at least 0: vdgs.count_visibility gives them")
     blocks, notes = partition_scene(places, counts.astype(np.int64), config, seed)

@@ -53,12 +53,19 @@ def to_torch(name: str, value: Any) -> Tensor:
     return tensor.float() if isinstance(value, np.ndarray) and tensor.dtype == torch.float64 else tensor
 
 
-def check_image_index(image_index: Any, decoders: Iterable[Decoder]) -> int | None:
-    """The number of a training photograph. Raises VdgsError for what is none of those that a decoder knows."""
+def check_finite_points(points: Tensor) -> None:
+    """Raise VdgsError for places [n, 3] that are not finite numbers."""
+    if wrong := int((~points.isfinite()).reshape(len(points), -1).any(1).sum()) if points.ndim else 0:
+        raise VdgsError(f"points must be finite, and {wrong} of {len(points)} are not: leave them out")
+
+
+def check_image_index(image_index: Any, decoders: Iterable[Decoder], num_images: int = MAX_COUNT) -> int | None:
+    """The number of a training photograph. Raises VdgsError for what is none of those that a decoder knows, or of so
+    many where none knows any."""
     if image_index is None:
         return None
     known = [len(each.appearance_embedding) for each in decoders if each.appearance_embedding is not None]
-    return int(checked_value("image_index", image_index, Annotated[int, Range(0, min(known, default=MAX_COUNT) - 1)]))
+    return int(checked_value("image_index", image_index, Annotated[int, Range(0, min(known, default=num_images) - 1)]))
 
 
 def like(given: Any, value: Any) -> Any:
@@ -90,7 +97,7 @@ def cameras_from(
     model = checked_value("model", model, CameraModel)
     given = (each.detach().cpu().numpy() if isinstance(each, Tensor) else each for each in (viewmats, Ks))
     poses, intrinsics = (np.array(each, np.float64) for each in given)
-    if poses.shape != (len(poses), 4, 4) or intrinsics.shape not in ((3, 3), (len(poses), 3, 3)):
+    if poses.shape[1:] != (4, 4) or intrinsics.shape not in ((3, 3), (len(poses), 3, 3)):
         raise ValueError(f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}")
     for index, pose in enumerate(poses):
         if not is_rigid_motion(pose):

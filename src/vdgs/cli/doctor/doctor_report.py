@@ -9,12 +9,14 @@ import json
 from dataclasses import asdict
 
 from vdgs.cli.doctor import SystemCheck
-from vdgs.cli.doctor.system_checks import CHECKS
+from vdgs.cli.doctor.system_checks import CHECKS, hidden_packages
 from vdgs.system.broken_packages import broken_packages, import_reason, reinstall_command
 
 
 def run_checks() -> list[SystemCheck]:
     """Look at the machine; takes a few seconds (torch is imported), changes nothing and never raises."""
+    if hidden := hidden_packages():
+        return hidden
     checks: list[SystemCheck] = []
     for check in CHECKS:
         try:

@@ -20,7 +20,7 @@ from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
 from vdgs.kernels import cpu_count
-from vdgs.system.broken_packages import import_reason, reinstall_command
+from vdgs.system.broken_packages import explain_shadows, import_reason, imported_name, reinstall_command
 from vdgs.system.cgroups import cgroup_limits, slurm_memory_limit
 from vdgs.system.exit_codes import REMOVABLE_PACKAGES
 from vdgs.system.stop_signals import preserve_signal_handlers
@@ -52,6 +52,15 @@ def _versions() -> list[SystemCheck]:
         SystemCheck("vdgs", "ok", _version("vdgs") or "not installed, run from a checkout"),
         SystemCheck("python", "ok" if new_enough else "broken", f"{python} on {platform.platform()}", remedy, True),
     ]
+
+
+def hidden_packages() -> list[SystemCheck]:
+    """The package that a file of its name hides, if any: others that import it may break in any way, or crash."""
+    required = map(imported_name, _required().get("", []))
+    if shadow := explain_shadows((*BINARY_MODULES, *required)):
+        remedy = "The command `vdgs`, unlike `python -m vdgs`, does not look into the current folder."
+        return [SystemCheck("dependencies", "broken", shadow, remedy, True)]
+    return []
 
 
 def _dependencies() -> list[SystemCheck]:

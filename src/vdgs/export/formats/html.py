@@ -44,6 +44,11 @@ WORDS_PER_GAUSSIAN = 8
 #: Lengths in the page are those of the scene times a power of two, with which the median Gaussian is about so large:
 #: covariances in float16 then hold all from 1/13 of it to 2000 times it.
 TARGET_MEDIAN_SIZE = 0.1
+#: What a page loses of every scene.
+PAGE_LOSSES = (
+    "colors do not change with the viewing direction",
+    "covariances are rounded to half precision, colors and opacities to bytes",
+)
 #: No standard deviation above this, in lengths of the page: its square ends below the largest float16.
 MAX_SIZE = 250.0
 #: Bytes a Gaussian takes are found on so many; they are right within this share.
@@ -103,7 +108,7 @@ def write_html(path: Path, scene: ExportScene) -> tuple[str, ...]:
         count = min(html_capacity(whole, page), int(0.9 * len(kept)))
         kept = merge_by_moments(whole, group_neighbors(whole, count))
     write_bytes(path, content)
-    lost = ["colors do not change with the viewing direction"]
+    lost = [*PAGE_LOSSES]
     if len(kept) < len(whole):
         lost.append(
             f"merged from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "

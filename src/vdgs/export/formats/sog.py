@@ -41,6 +41,8 @@ MAX_SH_CENTROIDS = 4096
 CENTROIDS_PER_ROW = 64
 #: Positions are whole numbers up to this.
 MAX_UINT16 = 65535
+#: What the file loses of every scene, beside positions.
+CODEBOOK_NOTE = "sizes and colors take 256 values each, opacities and rotations are rounded to bytes"
 
 
 def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
@@ -61,7 +63,10 @@ def write_sog(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
     write_atomic(path, write)
     write_metadata_file(path, scene.metadata, axes)
-    notes = [f"positions are rounded, farthest from the origin to {100 * coarsest:.1f} cm (if units are metres)"]
+    notes = [
+        f"positions are rounded, farthest from the origin to {100 * coarsest:.1f} cm (if units are metres)",
+        CODEBOOK_NOTE,
+    ]
     if scene.degree:
         notes.append(f"changing colors are taken from a palette of at most {MAX_SH_CENTROIDS}")
     return tuple(notes)

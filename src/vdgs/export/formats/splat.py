@@ -28,6 +28,10 @@ from vdgs.model.gaussians import Gaussians
 from vdgs.system.atomic_files import write_atomic, write_values
 
 SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+#: What the file loses of every scene.
+ROUNDING_NOTE = "colors, opacities and rotations are rounded to bytes"
+#: What the file loses of every scene.
+ROUNDING_NOTE = "colors, opacities and rotations are rounded to bytes"
 
 
 def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
@@ -48,7 +52,9 @@ def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
     write_atomic(path, write)
     write_metadata_file(path, scene.metadata, axes)
-    lost = ["colors no longer change with the viewing direction"] if scene.degree else []
+    lost = [ROUNDING_NOTE]
+    if scene.degree:
+        lost.append("colors no longer change with the viewing direction")
     if clipped:
         lost.append(f"{clipped} of {scene.count} colors lay outside of 0 .. 1 and were cut off")
     return tuple(lost)

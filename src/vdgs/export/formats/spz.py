@@ -54,6 +54,8 @@ COLOR_SCALE = 0.15
 #: Columns in the order of the file.
 COLUMN_NAMES = ("positions", "alphas", "colors", "scales", "rotations", "harmonics")
 READ_BLOCK_BYTES = 1 << 22
+#: What the file loses of every scene.
+ROUNDING_NOTE = "positions are rounded to 0.24 mm, colors and shapes to bytes"
 #: What a byte cannot hold, and what became of it.
 CLAMP_NOTES = {
     "large": "Gaussians are larger than 377 units and were cut to that",
@@ -103,7 +105,10 @@ def write_spz(path: Path, scene: ExportScene) -> tuple[str, ...]:
 
     write_atomic(path, write)
     write_metadata_file(path, scene.metadata, axes)
-    notes = [f"{cut[name]} of {scene.count} {what}" for name, what in CLAMP_NOTES.items() if cut[name]]
+    notes = [
+        ROUNDING_NOTE,
+        *(f"{cut[name]} of {scene.count} {what}" for name, what in CLAMP_NOTES.items() if cut[name]),
+    ]
     if scene.count > MAX_READABLE_POINTS:
         notes.append(
             f"holds {scene.count:,} Gaussians, and many programs open no SPZ of more than {MAX_READABLE_POINTS:,}. For "

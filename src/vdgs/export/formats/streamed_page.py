@@ -15,7 +15,7 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats.export_scene import ExportScene
 from vdgs.export.formats.file_folders import FileFolder, check_no_folder
 from vdgs.export.formats.gaussian_store import write_store
-from vdgs.export.formats.html import default_page_view, length_factor, packed_rows
+from vdgs.export.formats.html import PAGE_LOSSES, default_page_view, length_factor, packed_rows
 from vdgs.export.formats.tile_quadtree import build_tile_quadtree
 from vdgs.export.formats.tiles_3d import named_tiles
 from vdgs.model.gaussians import Gaussians
@@ -74,4 +74,4 @@ def write_streamed_page(path: Path, scene: ExportScene, node_size: int = MAX_NOD
         }  # fmt: skip
 
     NODE_FOLDER.write(path, fill)
-    return ("colors do not change with the viewing direction",)
+    return PAGE_LOSSES

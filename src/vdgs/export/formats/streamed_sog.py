@@ -21,7 +21,7 @@ from vdgs.export.formats.codebooks import VectorCodebook
 from vdgs.export.formats.export_scene import ExportMetadata, ExportScene, concatenate, write_metadata_file
 from vdgs.export.formats.file_folders import FileFolder, check_no_folder
 from vdgs.export.formats.gaussian_store import GaussianStore, in_memory, plane_blocks, write_store
-from vdgs.export.formats.sog import MAX_SH_CENTROIDS, fit_palette, write_sog_folder
+from vdgs.export.formats.sog import CODEBOOK_NOTE, MAX_SH_CENTROIDS, fit_palette, write_sog_folder
 from vdgs.kernels import get_backend
 from vdgs.model.gaussian_merging import merge_to
 from vdgs.model.gaussians import Gaussians
@@ -68,6 +68,7 @@ def write_streamed_sog(path: Path, scene: ExportScene, node_size: int = MAX_NODE
     LOD_FOLDER.write(path, fill)
     write_metadata_file(path, scene.metadata, axes)
     notes = [f"{levels} levels: each coarser one merged to a quarter of the Gaussians"] if levels > 1 else []
+    notes += ["positions are rounded", CODEBOOK_NOTE]
     if scene.degree:
         notes.append(f"changing colors are taken from a palette of at most {MAX_SH_CENTROIDS}")
     return tuple(notes)

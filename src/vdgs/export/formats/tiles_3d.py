@@ -60,7 +60,7 @@ def write_tiles(path: Path, scene: ExportScene, max_gaussians: int = MAX_GAUSSIA
         )
 
     TILE_FOLDER.write(path, fill)
-    notes = ["positions are rounded to 0.24 mm, colors and shapes to bytes"]
+    notes = [spz.ROUNDING_NOTE]
     if scene.metadata.geodetic is None:
         notes.append("the scene is not georeferenced: globes show it at the center of the Earth")
     return tuple(notes)
