@@ -30,8 +30,6 @@ from vdgs.system.atomic_files import write_atomic, write_values
 SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 #: What the file loses of every scene.
 ROUNDING_NOTE = "colors, opacities and rotations are rounded to bytes"
-#: What the file loses of every scene.
-ROUNDING_NOTE = "colors, opacities and rotations are rounded to bytes"
 
 
 def write_splat(path: Path, scene: ExportScene) -> tuple[str, ...]:
