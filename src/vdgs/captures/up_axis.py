@@ -60,10 +60,6 @@ OR_LEVEL = (
     "all photographs have the same side up and are rolled less if that is up: down from a plane that rolls, or level "
     "at a wall and its ground. Taken for the plane"
 )
-OR_SLOPE = (
-    "all photographs look the same way with the same side up: up at a ceiling, or straight down on a steep slope. "
-    "Taken for a ceiling"
-)
 HINT = "--up x|y|z|-x|-y|-z says it outright."
 
 
@@ -123,7 +119,8 @@ def _estimate(
     own, looking = float(views.image_up @ axis), float(views.forward @ axis)
     other = _other_up(views, axis)
     warnings += [f"{other.doubt}; if that is wrong, {HINT}"] if other is not None else []
-    if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
+    is_in_doubt = other is not None and other.doubt == OR_CEILING
+    if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)) and not is_in_doubt:
         return (-axis if own < 0 else axis), f"{how}, {UPPER_SIDES}", other
     if abs(looking) >= MIN_VIEW_COSINE:
         return (-axis if looking > 0 else axis), f"{how}, against the view", other
@@ -143,12 +140,9 @@ def _other_up(views: _Views, axis: np.ndarray) -> OtherUp | None:
         return OtherUp(level, OR_LEVEL)
     if not views.parallel or _turn_about(axis, views.rights, views.image_up):
         return None
-    if abs(own) >= max(MIN_UPRIGHT_COSINE, abs(looking)):
-        down = -views.forward / np.linalg.norm(views.forward)
-        return OtherUp(down, OR_SLOPE) if own * looking >= MIN_SIDES_PRODUCT else None
-    if 2 * abs(own) < abs(looking):
-        return OtherUp(level, OR_WALL)
-    return OtherUp(np.sign(own) * axis, OR_CEILING) if own * looking >= MIN_SIDES_PRODUCT else None
+    if own * looking >= MIN_SIDES_PRODUCT:
+        return OtherUp(np.sign(own) * axis, OR_CEILING)
+    return OtherUp(level, OR_WALL) if 2 * abs(own) < abs(looking) else None
 
 
 def _views(rotations: np.ndarray) -> _Views:

@@ -10,7 +10,7 @@ import numpy as np
 from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem
-from vdgs.captures.position_fit import fit_positions, with_likelier_up
+from vdgs.captures.position_fit import OTHER_COSINE, fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.errors import CaptureError
@@ -111,11 +111,10 @@ def georegister(
         has_altitudes=positions.has_altitudes,
     )
     problem, in_doubt = with_likelier_up(problem)
-    up = problem.up
     far = _viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
     fit, barometer, over_ground = _best_fit(levelled, taken)
-    wrong = _mirrored(fit, problem, images, positions)
+    wrong = _mirrored(fit, replace(problem, up=up), images, positions)
     if wrong and not anyway:
         raise CaptureError(
             f"the positions ({positions.source}) fit the photographs only once {wrong}: as they are, the world would "
@@ -143,7 +142,7 @@ def georegister(
     accuracy = accuracy_of(fit, positions, offsets, in_doubt)
     return Georegistration(
         similarity=fit.similarity,
-        method=_method(fit, barometer, on_a_line, positions.source, up.how),
+        method=_method(fit, barometer, on_a_line, positions.source, problem.up.how),
         position_rows=rows,
         targets=fit.placed - fit.residuals,
         residuals=_recorded(fit.placed - levelled.targets, positions),
@@ -169,9 +168,12 @@ def _deviations(positions: GpsPriors, rows: np.ndarray, stated: bool) -> tuple[n
 
 
 def _mirrored(fit: PositionFit, problem: Problem, images: Mapping[str, pycolmap.Image], positions: GpsPriors) -> str:
-    """Which other reading of the positions alone fits the photographs (`plane_fit.mirrored`); "" where they fit."""
+    """Which other reading of the positions alone fits the photographs (`plane_fit.mirrored`); "" where they fit. Up
+    that is not sure counts where the positions contradict it: views that look one way lie on their side by them, or
+    nothing fits."""
     views = np.array([camera_rotation(image) for image in images.values()]) @ fit.similarity.rotation.T
-    if not problem.up.sure and not are_turned_over(views):
+    is_doubted = problem.up.other is not None and fit.similarity.rotation[2] @ problem.up.direction < OTHER_COSINE
+    if not (problem.up.sure or is_doubted or fit.why_refused("") or are_turned_over(views)):
         return ""
     readings = _other_readings(problem.targets, positions.origin)
     return mirrored(problem.centers, problem.targets, problem.up.direction, readings)
