@@ -483,7 +483,12 @@ def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
         replace(photo, relative_altitude=40.0 + abs(m - north_m[0])) for photo, m in zip(strips, north_m, strict=True)
     ]
     assert np.ptp(north_m) > 30
-    assert should_fix_focal(slope, where, SfmOptions())[1].startswith("flown at one height over a slope")
+    assert should_fix_focal(slope, where, SfmOptions())[1].startswith("one height over a slope")
+    ascent = [
+        replace(photo, relative_altitude=10.0 + 5 * k, lat_lon=(seen[0].lat_lon[0] + 1e-6 * k, seen[0].lat_lon[1]))
+        for k, photo in enumerate(strips)
+    ]
+    assert not should_fix_focal(ascent, where, SfmOptions())[0]
     assert should_fix_focal(oblique, where, SfmOptions(focal="fixed"))[0]
 
 

@@ -247,7 +247,8 @@ def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) 
         apart = float(np.degrees(np.arccos(np.clip(up @ mean, -1, 1))))
         left = float(np.linalg.svd(rotations.mean(axis=0), compute_uv=False)[1])
         doubt = min(_lean_deg(length, left), apart / 2) if left < TURNED else apart / 2
-        return UpByViews(mean, max(VIEWS_DEG, doubt), other is None and bool(up @ mean > 0), other)
+        is_ceiling = other is not None and other.doubt == OR_CEILING
+        return UpByViews(mean, max(VIEWS_DEG, doubt), not is_ceiling and bool(up @ mean > 0), other)
     one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
     middle = up + (1 if one_way else 2) * mean
     deviation = UNCERTAIN_DEG if doubts and one_way else VIEWS_DEG * (2 if one_way else 1)  # maybe level at a wall

@@ -16,6 +16,7 @@ from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_
 from vdgs.captures.odd_positions import places_apart
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import SEMI_MAJOR_M
 from vdgs.sfm.capture_writer import is_impossible, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
@@ -32,8 +33,11 @@ from vdgs.system.lazy_pycolmap import pycolmap
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
 #: So many positions and more tell the slope that a flight follows (choice).
 MIN_FOR_SLOPE = 8
+#: Steeper than this (tangent) no flight follows the ground (choice).
+STEEPEST = 2.0
 #: Why a focal length is held until the model shows whether it can be fitted: `release_focal`.
 OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
+OF_SLOPE = "one height over a slope, or a climb over level ground; the model will show which"
 #: Why it is fitted then.
 OF_SHAPE = "several heights or views, as the photographs themselves show, which tell it"
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
@@ -103,7 +107,7 @@ def _by_flight(photographs: Sequence[ImageMetadata], bent: bool) -> tuple[bool, 
             if _range(heights - _of_flights(heights, flights)) <= steady:
                 return True, OF_FLIGHTS
             if _range(_over_slope(heights, known)) <= steady:
-                return True, "flown at one height over a slope: the flight cannot tell it"
+                return True, OF_SLOPE
             return False, "flown at several heights, which tell it"
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
@@ -128,23 +132,26 @@ def _of_flights(heights: np.ndarray, flights: np.ndarray) -> np.ndarray:
 
 
 def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np.ndarray:
-    """Heights [n] over the plane through them that fits best; as they are where positions do not tell one."""
+    """Heights [n] over the plane through them that fits best; as they are where positions do not tell one, and where
+    the plane is no slope: straight up over one place any plane explains heights."""
     places = np.array([photo.lat_lon or (np.nan, np.nan) for photo in photographs])
     if len(places) < MIN_FOR_SLOPE or not np.isfinite(places).all():
         return heights
     middle = places.mean(axis=0)
     away = (places - middle) * [1.0, np.cos(np.radians(middle[0]))]
     terms = np.column_stack([np.ones(len(away)), away / max(np.abs(away).max(), 1e-12)])
-    return np.asarray(heights - terms @ np.linalg.lstsq(terms, heights, rcond=None)[0])
+    plane = np.linalg.lstsq(terms, heights, rcond=None)[0]
+    rise = float(np.linalg.norm(plane[1:])) / (np.radians(np.abs(away).max()) * SEMI_MAJOR_M)
+    return np.asarray(heights - terms @ plane) if rise < STEEPEST else heights
 
 
 def release_focal(
     models: list[pycolmap.Reconstruction], held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
 ) -> tuple[bool, str]:
-    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS but the photographs alone show that
-    they were taken from several heights or look several ways, unless it goes astray. Whether it is held then, and
-    why."""
-    if held != (True, OF_FLIGHTS):
+    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS or OF_SLOPE but the photographs
+    alone show that they were taken from several heights or look several ways, unless it goes astray. Whether it is held
+    then, and why."""
+    if not held[0] or held[1] not in (OF_FLIGHTS, OF_SLOPE):
         return held
     model = models[0]
     images = [image for image in placed_images(model) if image.num_points3D]
