@@ -36,7 +36,7 @@ from vdgs.captures.position_fit import fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import by_axis, told_up
 from vdgs.captures.tables_beside import position_tables, table_note
-from vdgs.captures.up_axis import HINT, estimate_up, up_by_views
+from vdgs.captures.up_axis import HINT, OR_CEILING, estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
@@ -258,7 +258,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         stated=deviations if are_told(deviations, said) else None, relative=relative_deviations(deviations),
     )  # fmt: skip
     image = enu * [-1.0, 1.0, 1.0]  # of which exchanged axes are a turn
-    if up.sure and mirrored(centers, enu, up.direction, {"the mirror image": image}):
+    is_told = up.sure or (up.other is not None and up.other.doubt == OR_CEILING)
+    if is_told and mirrored(centers, enu, up.direction, {"the mirror image": image}):
         raise CaptureError(
             f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
             "minus sign of south or west missing? Mend the table, or leave --gps out."

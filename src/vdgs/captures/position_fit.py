@@ -42,8 +42,10 @@ def with_likelier_up(problem: Problem) -> tuple[Problem, str]:
     other = problem.up.other
     if other is None:
         return problem, ""
-    turned = replace(problem, up=replace(problem.up, direction=other.direction, how=OTHER_VIEW))
+    turned = replace(problem, up=replace(problem.up, direction=other.direction, how=OTHER_VIEW, sure=False))
     fit, usual = fit_positions(turned), fit_positions(problem)
+    if (fit.altitude == "none") != (usual.altitude == "none"):  # likelihoods of different things
+        return problem, ""
     if abs(fit.score - usual.score) <= OTHER_COSTS:
         return problem, f"{other.doubt}, for the positions do not tell"
     is_upright = fit.similarity.rotation[2] @ other.direction > OTHER_COSINE  # else neither is up: are they mirrored?

@@ -54,18 +54,27 @@ def _up_by_attitudes(rotations: np.ndarray, down: np.ndarray, views: Up) -> tupl
     middle = geometric_median(ups)  # some may be wrong
     mean = middle / max(float(np.linalg.norm(middle)), 1e-12)
     scatter = float(np.median(np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))))
-    apart = float(np.degrees(np.arccos(np.clip(mean @ views.direction, -1, 1))))
+    apart = _between_deg(mean, views.direction)
+    apart_from_other = 180.0 if views.other is None else _between_deg(mean, views.other.direction)
     level = rotation_to_z(mean)
     tilt, several, agree = tilt_of_attitudes(rotations @ level.T, down)
     most = max(CONTRADICT_DEG, CONTRADICT_SIGMAS * views.deviation_deg)
-    if scatter > SCATTER_DEG or (views.sure and not several and apart > most):
+    contradicts = (views.sure or views.other is not None) and not several and min(apart, apart_from_other) > most
+    if scatter > SCATTER_DEG or contradicts:
         return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
+    if views.sure and not several and apart > most:  # the positions tell, as far as they can
+        return views, []
     found = level.T @ np.append(-tilt, 1.0)
     deviation = float(np.hypot(scatter / np.sqrt(len(down)), HANGS_DEG if several else HANGS_ALIKE_DEG))
     doubt, wrong = LOOKED_UP if apart > 90 else "", int((~agree).sum())
     many = wrong >= WRONG_ATTITUDES * len(down)
     notes = [f"{wrong} of {len(down)} recorded attitudes contradict the others, and are not used."] if many else []
     return Up(found / np.linalg.norm(found), deviation, BY_ATTITUDES, doubt=doubt), notes
+
+
+def _between_deg(one: np.ndarray, other: np.ndarray) -> float:
+    """The angle between unit vectors [3]."""
+    return float(np.degrees(np.arccos(np.clip(one @ other, -1, 1))))
 
 
 def tilt_from_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) -> float | None:

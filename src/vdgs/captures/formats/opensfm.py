@@ -172,12 +172,12 @@ def _is_nearer_in_utm(reconstruction: JsonObject, offset: _Offset, enu: ToGeodet
     origin = median_place(gps)
     known = enu_from_geodetic(gps, origin)
 
-    def squares_away(system: ToGeodetic) -> float:
+    def distance(system: ToGeodetic) -> float:
         places = enu_from_geodetic(system(centers), origin)
         away = np.linalg.norm(places - known, axis=1) if told else cKDTree(known).query(places)[0]
-        return float((away**2).sum())
+        return float(np.median(away))  # some of the GPS may be wild
 
-    return squares_away(offset.to_geodetic) < squares_away(enu)
+    return distance(offset.to_geodetic) < distance(enu)
 
 
 def _center(shot: JsonObject, file: Path) -> np.ndarray:
