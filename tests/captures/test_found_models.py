@@ -182,21 +182,33 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
             "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n1.5 1 2 3 0 0 0 1\n",
             "TUM RGB-D",
         ),
-        ("poses/00.txt", 2 * (" ".join(["1.0e+00", *11 * ["-2.5e-03"]]) + "\n"), "poses of KITTI; written as"),
+        ("poses/00.txt", "1.0e+00 0 0 2.5 0 8e-01 -6e-01 0 0 6e-01 8e-01 -1\n" * 2, "poses of KITTI; written as"),
         ("calib.txt", f"P0: {' '.join(12 * ['7.188560e+02'])}\n", "lenses of KITTI"),
         ("pose/a.txt", " ".join(["1", *11 * ["-0.25"], "0", "0.0", "0", "1.0"]), "a matrix of a photograph"),
         ("pose/b.txt", "\n".join([*3 * ["1 0 -2e-3 4.5"], "0 0 0 1", ""]), "as transforms.json"),
         ("bbox.txt", "-1 -1 -1 1 1 1 0.1 and no more\n", "a set of NSVF"),
         ("gt/data.csv", "#timestamp, p_RS_R_x [m], p_RS_R_y [m]\n1,2,3\n", "poses of EuRoC"),
-        ("poses.txt", "".join(f"{k} {' '.join(12 * ['-2.5e-1'])}\n" for k in (1, 5)), "poses of KITTI-360"),
-        ("cam0_to_world.txt", "".join(f"{k} {' '.join(16 * ['0.5'])} \n" for k in (1, 5)), "poses of KITTI-360"),
+        ("poses.txt", "".join(f"{k} 0 -1 0 {k}.5 1 0 0 -7e2 0 0 1 116\n" for k in (1, 5)), "poses of KITTI-360"),
+        ("cam0_to_world.txt", "".join(f"{k} 0 0 1 9.5 1 0 0 0 0 1 0 0 0 0 0 1 \n" for k in (1, 5)), "of KITTI-360"),
         ("sampleinfos_interpolated.json", '[{"OriginalImageName": "1.jpg", "T4x4": []}]', "poses of UAVScenes"),
         ("Ori-1/Ori-PerspCentral-a.jpg.xml", "<Root><CameraPose><Center/></CameraPose></Root>", "poses of MMVII"),
         ("views/view_0000.mve/meta.ini", "[camera]\nfocal_length = 0.9\nrotation = 1 0 0", "poses of MVE"),
         ("calib/pos_001.txt", "9.5 -1e2 2 3\n4 5 -6 7\n0.1 0.2 0.3 654.5\n", "(DTU)"),
         ("frame_00001.json", '{"cameraPoseARFrame": [0.1, 0.2], "intrinsics": [1]}', "3D Scanner App"),
         ("poses_ts.json", '{"timestamps": [1, 2, 3], "poses": []}', "poses of OMMO"),
-        ("gt.txt", 2 * "1305031102.1758 1.3405 0.6266 -1.6575 0.6574 0.6126 -0.2949 -3.3e-1\n", "like those of TUM"),
+        (
+            "gt.txt",
+            "".join(f"130503110{k}.1758 1.3405 0.6266 -1.6575 0.6574 0.6126 -0.2949 -3.248e-1\n" for k in range(3)),
+            "like those of TUM",
+        ),
+        ("still.txt", "".join(f"{k}.5 0 0 {k} 0 0 0 1\n" for k in range(3)), "like those of TUM"),
+        ("eo.dat", "EO of a block\nID;X0;Y0;Z0;Omega;Phi;Kappa\n7;1,5;2;3;4,5;5;6\n", "omega, phi, kappa"),
+        ("ros.csv", "stamp,tx,ty,tz,qx,qy,qz,qw\n1,2,3,4,0,0,0,1\n", "quaternions without lenses"),
+        (
+            "first_unplaced.out",
+            "2 1\n" + "0 0 0\n" * 5 + "700.5 -0.1 0.02\n1 0 0\n0 1 0\n0 0 1\n-1e-3 2 3\n",
+            "without the first line",
+        ),
         ("poses.csv", "image,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,0,0,0\n", "quaternions without lenses.*transforms.json"),
         ("poses.txt", "#name x y z q_x q_y q_z q_w\na.jpg 1 2 3 0 0 0 1\n", "quaternions without lenses.*--gps FILE"),
         ("a.csv", "#name,x,y,alt,heading,pitch,roll\na.jpg,1,2,3,4,5,6\n", "poses of RealityScan without lenses"),
@@ -234,6 +246,36 @@ def test_other_texts_of_numbers_are_no_poses(tmp_path):
     }  # fmt: skip
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
+    assert foreign_poses(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("grid.out", "3 4\n1 2 3\n4 5 6\n7 8 9\n1 2 3\n4 5 6\n"),
+        ("xyz.out", "100 200\n" + 8 * "1.5 2.5 3.5\n"),
+        ("zeros.out", "100 200\n" + 10 * "0 0 0\n"),
+        ("transform.txt", "1 0 0 5\n0 1 0 6\n0 0 1 7\n"),
+        ("calib.txt", "2000 0 1024 0\n0 2000 768 0\n0 0 1 0\n"),
+        ("gcp.txt", "".join(f"{k} 50000{k}.1 520000{k}.2 412.3\n" for k in range(3))),
+        ("rtk.txt", "".join(f"170000000{k}.1 47.1 8.1 412.3 0.01 0.01 0.02 1\n" for k in range(5))),
+        ("float.txt", "".join(f"170000000{k}.1 47.1 8.1 412.3 0.01 0.01 0.02 2\n" for k in range(5))),
+        ("normals.txt", "".join(f"{k}.0 2.0 3.0 4.0 0.1 0.2 0.3 0.4\n" for k in range(5))),
+        ("falls.txt", "".join(f"{9 - k} 2.0 3.0 4.0 0 0 0.6 0.8\n" for k in range(5))),
+        ("spectra.txt", "".join(f"{k} {' '.join(12 * ['0.25'])}\n" for k in range(400, 420))),
+        ("poses.txt", "".join(f"{k} {' '.join(16 * ['0.25'])}\n" for k in range(400, 420))),
+        ("bands.txt", "".join(f"{k} {' '.join(11 * ['0.25'])}\n" for k in range(400, 420))),
+        ("readme.txt", "Angles are given as omega, phi, kappa in the delivered files.\nAll good.\n"),
+        ("delivery.txt", "The columns are name, x, y, z, omega, phi, kappa.\nIn metres, gon, and so on.\n"),
+        ("ppk.csv", "name,lat,lon,alt,omega,phi,kappa\na.jpg,47.1,8.1,410,0,0,90\n"),
+        ("geo.txt", "EPSG:32632\n#name x y z omega phi kappa\na.jpg 500000.1 5200000.1 410 0 0 90\n"),
+        ("angles.dat", "time omega phi kappa\n1 2 3 4\n"),
+        ("imu.csv", "timestamp,gx,gy,gz,ax,ay,az,qw,qx,qy,qz\n1,2,3,4,5,6,7,1,0,0,0\n"),
+        ("heading.csv", "image,x,y,z,qw,qx,qy,qz\n"),
+    ],
+)
+def test_texts_that_only_look_like_poses_are_not_named(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
     assert foreign_poses(tmp_path) == []
 
 
