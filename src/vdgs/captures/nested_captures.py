@@ -53,7 +53,10 @@ _WRITE = (
 _AS_OTHERS = "a BlocksExchange, OPF or Agisoft XML file of the same project is read"
 _MVE = "poses of MVE; the .nvm or bundle.out that its makescene was given is read"
 _METASHAPE_TABLE = "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read"
-_POSITIONS = "; its positions alone: --gps FILE, with the code of their coordinate system as a first line of its own"
+_POSITIONS = (
+    "; its positions alone: --gps FILE, where they are metres with the code of their coordinate system as a first line "
+    "of its own"
+)
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
     "*.psx": _METASHAPE,
@@ -93,9 +96,8 @@ _OTHERS = {
     "itera.dat": f"orientations of BINGO; {_AS_OTHERS}",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
-#: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
 _ALIGN = "it is read once its photographs are aligned and it is exported again"
-_TABLES = frozenset({".txt", ".csv", ".opk", ".dat"})
+#: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
 _BY_CONTENT = (
     (".xml", rb"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
     (".xml", rb"<document version", f"an export of Metashape without poses; {_ALIGN}"),
@@ -154,6 +156,8 @@ _BY_CONTENT = (
         "a project of Inpho; Metashape imports it (File > Import > Import Cameras), and its Agisoft XML is read",
     ),
 )  # fmt: skip
+#: Suffixes of tables of poses that any program may have written.
+_TABLES = frozenset({".txt", ".csv", ".opk", ".dat"})
 #: The same for texts of numbers, which anything may be: what tells them by their names, headings and values.
 _BY_NUMBERS: tuple[tuple[frozenset[str], Callable[[str, str], bool], str], ...] = (
     (frozenset({".txt"}), is_kitti, f"poses of KITTI; {_WRITE}"),
