@@ -251,6 +251,30 @@ def test_rows_that_end_before_the_lens_are_refused(tmp_path: Path, flight: Known
         read(tmp_path, "realityscan")
 
 
+def test_rows_may_leave_out_the_terms_that_no_row_has(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_realityscan_csv(tmp_path / "cameras.csv", flight)
+    whole = realityscan.read_camera_table(file)
+    head, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([f"{head},pxpix", *rows[:2], *(f"{row}," for row in rows[2:])]))
+    assert [camera.lens for camera in realityscan.read_camera_table(file)] == [camera.lens for camera in whole]
+    file.write_text("name,x,y,alt,heading,pitch,roll,f,k1,k2,k3\na.jpg,1,2,3,4,5,6,35,0.1\nb.jpg,1,2,3,4,5,6,35,,,\n")
+    assert [dict(camera.lens) for camera in realityscan.read_camera_table(file)] == [{"k1": 0.1}, {}]
+
+
+@pytest.mark.parametrize(
+    ("head", "lacks"),
+    [
+        ("name,x,y,alt,heading,pitch,roll,fpix", "tx, ty, tz, r00"),
+        ("name,tx,ty,tz,r00,r01,r02,r10,r11,r12,r20,r21,r22,f", "x, y, alt, heading"),
+    ],
+)
+def test_a_table_whose_focal_length_is_not_of_its_poses_is_refused(tmp_path: Path, head: str, lacks: str) -> None:
+    file = tmp_path / "cameras.csv"
+    file.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
+    with pytest.raises(CaptureError, match=f"has no column {lacks}"):
+        realityscan.read_camera_table(file)
+
+
 def test_equal_names_in_a_project_that_knows_no_folders_need_names_of_their_own(
     tmp_path: Path, flight: KnownFlight
 ) -> None:

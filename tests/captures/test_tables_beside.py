@@ -66,6 +66,26 @@ def test_a_table_of_positions_with_angles_is_no_registration(tmp_path, first_lin
     assert len(plan_reconstruction(request).gps_priors) == 3
 
 
+@pytest.mark.parametrize(
+    ("head", "row", "is_told"),
+    [
+        ("image,x,y,marker\n", "{},512.3,30{}.1,GCP1\n", False),
+        ("image,x,y,z\n", "{},500123.4,520012{}.5,410\n", True),
+        ("image,width,height\n", "{},4000,300{}\n", False),
+        ("", "{},512.3,30{}.1,GCP1\n", False),
+        ("", "{},4512.3,30{}.1,3\n", False),
+        ("", "{},4000,300{},3\n", False),
+        ("", "{},400,32{},2.8\n", False),
+        ("", "{},500123.4,520012{}.5,410\n", True),
+    ],
+)
+def test_only_positions_are_told_to_lack_a_system(tmp_path, head, row, is_told):
+    """Sizes, exposures and marks in photographs are tables of names and numbers too."""
+    text = head + "".join(row.format(f"{{{k}}}", k) for k in range(3))
+    _, said = planned(tmp_path, "card/table.csv", text, placed=True)
+    assert [("coordinate system" in each) for each in said] == ([True] if is_told else [])
+
+
 @pytest.mark.parametrize("name", ["card/geo.txt", "geo.txt"])
 def test_the_table_of_odm_is_used_where_photographs_say_no_positions(tmp_path, name):
     priors, (said,) = planned(tmp_path, name, TABLES[name], placed=False)

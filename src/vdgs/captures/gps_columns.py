@@ -34,14 +34,18 @@ BY_TIME = (
 )
 #: Columns of accuracies.
 DEVIATIONS = ("across", "upwards", "eastwards", "northwards")
+#: Coordinates of a projected system are so large, in metres, and one of them larger than any photograph has pixels; a
+#: flight is no wider (choice).
+_FLIGHT_FROM, _PROJECTED_FROM, _FLIGHT_WIDE = 1_000.0, 20_000.0, 100_000.0
 
 
 class NoSystem(CaptureError):
-    """A table of x and y whose coordinate system nothing names, with the photographs that it names."""
+    """A table of x and y whose coordinate system nothing names, with the photographs that it names, and whether x and y
+    are positions for sure: sizes, marks and scores of photographs look alike."""
 
-    def __init__(self, message: str, names: Sequence[str]) -> None:
+    def __init__(self, message: str, names: Sequence[str], *, are_positions: bool) -> None:
         super().__init__(message)
-        self.names = tuple(names)
+        self.names, self.are_positions = tuple(names), are_positions
 
 
 class Columns(NamedTuple):
@@ -150,6 +154,7 @@ def _with_plane(columns: Columns, rows: Sequence[Row], system: str | None, file:
             "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
             "give name,lat,lon,alt.",
             [row.words[known["name"]] for row in body if len(row.words) > known["name"]],
+            are_positions="alt" in known or {read_heading(word).stem for word in (x, y)}.isdisjoint({"x", "y"}),
         )
     return columns._replace(system=system, across_units=(told_meters(x), told_meters(y)))
 
@@ -180,6 +185,7 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
             f"{file}: names neither its columns nor the coordinate system of values such as {words[1]}, "
             f"{words[2]}. Write its code as a first line of its own, such as EPSG:32633.",
             [row.words[0] for row in rows],
+            are_positions=_are_places(rows),
         )
     swapped = largest[0] > 90
     where = {"lat": 2 if swapped else 1, "lon": 1 if swapped else 2}
@@ -187,6 +193,18 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
     more = ", ..., accuracies across and up" if "across" in order else ""
     note = "" if swapped and not more else f"names no columns; read as {read}{more}."
     return Columns({**order, **where}, None, note=note)
+
+
+def _are_places(rows: Sequence[Row]) -> bool:
+    """Whether rows of no headings hold x, y and z of a flight in metres of a projected system."""
+    values = [[number_of(word) for word in row.words[1:4]] for row in rows if len(row.words) > 3]
+    places = np.array(values, float).reshape(-1, 3)
+    if len(places) < len(rows) or not np.isfinite(places).all():
+        return False
+    plane = places[:, :2]
+    across, wide = np.median(np.abs(plane), axis=0), np.ptp(plane, axis=0).max()
+    is_far = across.min() > _FLIGHT_FROM and across.max() > _PROJECTED_FROM
+    return bool(is_far and 0 < wide < _FLIGHT_WIDE and (plane % 1 != 0).any())
 
 
 def _is_datum(system: str, file: Path) -> bool:

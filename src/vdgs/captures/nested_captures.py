@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path, PurePath
 
@@ -17,8 +17,18 @@ from vdgs.captures.formats.mvsnet import CAMERA_END, is_mvsnet, read_mvsnet
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.image_files import readable_suffixes
 from vdgs.captures.output_guard import is_capture
+from vdgs.captures.pose_texts import (
+    is_angle_table,
+    is_bundler,
+    is_dtu,
+    is_kitti,
+    is_kitti_360,
+    is_quaternion_table,
+    is_tum,
+)
 from vdgs.captures.project_formats import PROJECTS, find_projects
 from vdgs.captures.strays import is_mask_folder, why_not_read
+from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
@@ -43,7 +53,10 @@ _WRITE = (
 _AS_OTHERS = "a BlocksExchange, OPF or Agisoft XML file of the same project is read"
 _MVE = "poses of MVE; the .nvm or bundle.out that its makescene was given is read"
 _METASHAPE_TABLE = "poses of Metashape without lenses; its Agisoft XML (File > Export > Export Cameras) is read"
-_POSITIONS = "; its positions alone: --gps FILE, with the code of their coordinate system as a first line of its own"
+_POSITIONS = (
+    "; its positions alone: --gps FILE, where they are metres with the code of their coordinate system as a first line "
+    "of its own"
+)
 #: Poses of programs that are not read, by the file that has them, and what turns them into what is.
 _OTHERS = {
     "*.psx": _METASHAPE,
@@ -83,20 +96,8 @@ _OTHERS = {
     "itera.dat": f"orientations of BINGO; {_AS_OTHERS}",
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
-#: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
 _ALIGN = "it is read once its photographs are aligned and it is exported again"
-#: Tables of poses that any program may have written, by the names of their columns in one of the first lines.
-_POSE_TABLES = (
-    (
-        rb"\A(?:[^\n]*\n){0,3}[^\n]*omega[^\n]*phi[^\n]*kappa",
-        "positions and angles (omega, phi, kappa) without lenses, which are not read; as BlocksExchange, OPF, Agisoft "
-        f"XML or with the lens as transforms.json they are{_POSITIONS}",
-    ),
-    (
-        rb"\A[^\n]*(?:q_?w[^\n]*q_?x[^\n]*q_?y[^\n]*q_?z|q_?x[^\n]*q_?y[^\n]*q_?z[^\n]*q_?w)",
-        f"positions and quaternions without lenses, which are not read; {_WRITE}{_POSITIONS}",
-    ),
-)
+#: The same for files that only their beginning tells: the suffix, a pattern in lower case, and what it is.
 _BY_CONTENT = (
     (".xml", rb"<blocksexchange", f"a BlocksExchange file without poses; {_ALIGN}"),
     (".xml", rb"<document version", f"an export of Metashape without poses; {_ALIGN}"),
@@ -120,24 +121,10 @@ _BY_CONTENT = (
     *((suffix, rb"photoid, ?x, ?y, ?z, ?omega", _METASHAPE_TABLE + _POSITIONS) for suffix in (".txt", ".csv")),
     (".txt", rb"\A# *kapture format", _KAPTURE),
     (".txt", rb"# *timestamp,?\s+tx,?\s+ty,?\s+tz,?\s+qx", f"poses of TUM RGB-D; {_WRITE}"),
-    (".txt", rb"\A(?:(?:[-+.\de]+ ){11}[-+.\de]+ *\r?\n){2}", f"poses of KITTI; {_WRITE}"),
-    (
-        ".txt", rb"\A(?:\d+ (?:[-+.\de]+ ){11}(?:(?:[-+.\de]+ ){4})?[-+.\de]+ *\r?\n){2}",
-        f"poses of KITTI-360; {_WRITE}",
-    ),
-    (
-        ".txt",
-        rb"\A(?:\d[.\de+]*(?: [-+]?\d[-+.\de]*){3}(?: [-+]?(?:0?\.\d+|[01](?:\.0*)?|[.\d]+e-\d+)){4} *\r?\n){2}",
-        f"poses like those of TUM RGB-D; {_WRITE}",
-    ),
     (".txt", rb"\Ap0: (?:[-+.\de]+ ){11}", f"lenses of KITTI; {_WRITE}"),
     (
         ".txt", rb"\A\s*(?:[-+.\de]+\s+){12}(?:[-+]?0(?:\.0*)?(?:e[-+]\d+)?\s+){3}1(?:\.0*)?(?:e\+?0+)?\s*\Z",
         f"a matrix of a photograph (NSVF, NeRF-OSR, ScanNet, 7-Scenes); {_WRITE}",
-    ),
-    (
-        ".txt", rb"\A\s*(?:(?:[-+.\de]+[ \t]+){3}[-+.\de]+[ \t]*\r?\n\s*){2}(?:[-+.\de]+[ \t]+){3}[-+.\de]+\s*\Z",
-        f"a projection matrix of a photograph (DTU); {_WRITE}",
     ),
     (
         ".csv", rb"\A#?name,x,y,(?:alt|z),(?:heading|yaw),pitch,roll *\r?\n",
@@ -165,15 +152,35 @@ _BY_CONTENT = (
     ),
     (".r3d", rb"", "a capture of Record3D; ns-process-data record3d (nerfstudio) makes transforms.json, which is read"),
     (
-        ".out", rb"\A\s*\d+ \d+ *\r?\n(?:(?:[-+.\de]+ +){2}[-+.\de]+ *\r?\n){5}",
-        "poses of Bundler without the first line of their file; with the line '# Bundle file v0.3' in front it is read",
-    ),
-    *((suffix, *table) for suffix in (".txt", ".csv", ".opk", ".dat") for table in _POSE_TABLES),
-    (
         ".prj", rb"\$project",
         "a project of Inpho; Metashape imports it (File > Import > Import Cameras), and its Agisoft XML is read",
     ),
 )  # fmt: skip
+#: Suffixes of tables of poses that any program may have written.
+_TABLES = frozenset({".txt", ".csv", ".opk", ".dat"})
+#: The same for texts of numbers, which anything may be: what tells them by their names, headings and values.
+_BY_NUMBERS: tuple[tuple[frozenset[str], Callable[[str, str], bool], str], ...] = (
+    (frozenset({".txt"}), is_kitti, f"poses of KITTI; {_WRITE}"),
+    (frozenset({".txt"}), is_kitti_360, f"poses of KITTI-360; {_WRITE}"),
+    (frozenset({".txt"}), is_tum, f"poses like those of TUM RGB-D; {_WRITE}"),
+    (frozenset({".txt"}), is_dtu, f"a projection matrix of a photograph (DTU); {_WRITE}"),
+    (
+        frozenset({".out"}),
+        is_bundler,
+        "poses of Bundler without the first line of their file; with the line '# Bundle file v0.3' in front it is read",
+    ),
+    (
+        _TABLES,
+        is_angle_table,
+        "positions and angles (omega, phi, kappa) without lenses, which are not read; as BlocksExchange, OPF, Agisoft "
+        f"XML or with the lens as transforms.json they are{_POSITIONS}",
+    ),
+    (
+        _TABLES,
+        is_quaternion_table,
+        f"positions and quaternions without lenses, which are not read; {_WRITE}{_POSITIONS}",
+    ),
+)
 _HEAD_BYTES = 4096
 #: Files beside transforms_train.json, and those of a COLMAP model.
 _SET_FILES = {"transforms_train.json", "transforms_test.json", "transforms_val.json"}
@@ -316,14 +323,18 @@ def _capture_of(file: Path) -> Path | None:
 def _by_content(file: Path) -> str:
     """What a file is of those that only their beginning tells; empty for others."""
     known = [(pattern, what) for suffix, pattern, what in _BY_CONTENT if file.suffix.lower() == suffix]
-    if not known or not file.is_file():
+    checks = [(is_this, what) for suffixes, is_this, what in _BY_NUMBERS if file.suffix.lower() in suffixes]
+    if not (known or checks) or not file.is_file():
         return ""
     try:
         with file.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES).lower()
+            head = stream.read(_HEAD_BYTES)
     except OSError:
         return ""
-    return next((what for pattern, what in known if re.search(pattern, head)), "")
+    found = next((what for pattern, what in known if re.search(pattern, head.lower())), "")
+    path, text = file.absolute().as_posix(), decode_text(head)
+    whole = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]  # the last line may be cut
+    return found or next((what for is_this, what in checks if is_this(path, whole)), "")
 
 
 def _folders(root: Path) -> Iterator[Path]:

@@ -44,7 +44,8 @@ def position_tables(
             found.append(TableBeside(file, len(match_rows(names, table.rows, file, table.numbered))))
         except NoSystem as error:
             rows = [GpsRow(0, name, (0.0, 0.0, 0.0)) for name in error.names]
-            if file.name.lower() == ODM_POSITIONS or (without_system and _count(names, rows, file) >= _MIN_ROWS):
+            is_told = without_system and error.are_positions and _count(names, rows, file) >= _MIN_ROWS
+            if is_told or file.name.lower() == ODM_POSITIONS:
                 found.append(TableBeside(file, 0, str(error)))
         except CaptureError as error:  # mostly some other text
             found += [TableBeside(file, 0, str(error))] if file.name.lower() == ODM_POSITIONS else []

@@ -38,9 +38,13 @@ from vdgs.system.units import first_names
 _POSE = ("x", "y", "alt", "heading", "pitch", "roll")
 _MATRIX = ("tx", "ty", "tz", *(f"r{row}{column}" for row in range(3) for column in range(3)))
 _LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-#: Columns of the focal length, and all that are read: a row that ends before one of them is cut.
+#: Columns of the focal length; those that a camera needs, and the terms of its lens, by that which a table has.
 _FOCAL = {"f", "fpix"}
-_READ = {"name", *_FOCAL, "pxpix", "pypix", *_POSE, *_MATRIX, *_LENS}
+_NEEDED = {"f": ("name", "f", *_POSE), "fpix": ("name", "fpix", *_MATRIX)}
+_TERMS = {
+    "f": {key: key for key in _LENS},
+    "fpix": {"px": "pxpix", "py": "pypix", **{key: key for key in _LENS[2:]}},
+}
 #: What people's own templates call the columns.
 _ALIASES = {
     "file": "name", "filename": "name", "image": "name", "imagename": "name", "label": "name",
@@ -260,21 +264,23 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
             f"{file}: has no column f, the focal length. Export 'Internal/External camera parameters' instead; a table "
             "of positions is given beside the photographs, as --gps."
         )
+    focal = _focal_column(names, file)
+    rows = list(enumerate(csv.reader(io.StringIO("\n".join(lines[start + 1 :])), delimiter=delimiter), start + 2))
+    rows = [(number, row) for number, row in rows if "".join(row).strip() and not row[0].startswith("#")]
+    told = {name for _, row in rows for name, word in zip(names, row, strict=False) if word.strip()}
+    read = {*_NEEDED[focal], *(told & {*_TERMS[focal].values()})}
     cameras, problems = [], []
-    rows = csv.reader(io.StringIO("\n".join(lines[start + 1 :])), delimiter=delimiter)
-    for number, row in enumerate(rows, start + 2):
-        if not "".join(row).strip() or row[0].startswith("#"):
-            continue
+    for number, row in rows:
         try:
-            if missing := [name for name in names[len(row) :] if name in _READ]:
+            if missing := [name for name in names[len(row) :] if name in read]:
                 raise ValueError(f"ends before {', '.join(missing)}")
-            cameras.append(_row_camera(dict(zip(names, row, strict=False)), delimiter, file))
+            cameras.append(_row_camera(dict(zip(names, row, strict=False)), focal, delimiter, file))
         except ValueError as error:
             problems.append(f"line {number}: {error}")
     if problems:
         listed = "".join(f"\n  {each}" for each in problems[:10])
         raise CaptureError(f"{file}: {len(problems)} of its rows cannot be read. {_AGAIN}{listed}")
-    if cameras and "f" in names and np.median([camera.focal_35mm for camera in cameras]) > _LONGEST_35MM:
+    if cameras and focal == "f" and np.median([camera.focal_35mm for camera in cameras]) > _LONGEST_35MM:
         raise CaptureError(
             f"{file}: has focal lengths of {cameras[0].focal_35mm:g} mm as of 35 mm film. Are they in pixels? Export "
             "'Internal/External camera parameters' as RealityScan has them."
@@ -282,8 +288,18 @@ def read_camera_table(file: Path) -> list[RegisteredCamera]:
     return cameras
 
 
-def _row_camera(row: dict[str, str], delimiter: str, file: Path) -> RegisteredCamera:
-    """Raises ValueError for what is no number."""
+def _focal_column(names: list[str], file: Path) -> str:
+    """Which focal length of a table is read: in pixels with a matrix, else in millimetres with angles."""
+    lacking = {focal: [name for name in _NEEDED[focal] if name not in names] for focal in ("fpix", "f")}
+    complete = [focal for focal, missing in lacking.items() if not missing]
+    if not complete:
+        missing = lacking["fpix" if "fpix" in names else "f"]
+        raise CaptureError(f"{file}: has no column {', '.join(missing)}. {_AGAIN}")
+    return complete[0]
+
+
+def _row_camera(row: dict[str, str], focal: str, delimiter: str, file: Path) -> RegisteredCamera:
+    """The camera of a row that has all columns that are needed. Raises ValueError for what is no number."""
 
     def number(key: str) -> float:
         value = float(row[key].replace(",", ".") if delimiter == ";" else row[key])
@@ -291,21 +307,20 @@ def _row_camera(row: dict[str, str], delimiter: str, file: Path) -> RegisteredCa
             raise ValueError(f"{key} is {row[key].strip()}")
         return value
 
-    if "fpix" in row:
+    if focal == "fpix":
         values = list(map(number, _MATRIX))
         pose = to_rigid(np.column_stack([np.reshape(values[3:], (3, 3)), values[:3]]), file, row["name"].strip())
-        terms = {key: key for key in _LENS[2:]} | {"px": "pxpix", "py": "pypix"}
-        lens = {key: number(column) for key, column in terms.items() if row.get(column, "").strip()}
-        return RegisteredCamera(
-            name=row["name"].strip(), camera_from_world=pose, focal_35mm=number("fpix"), lens=lens, in_pixels=True
-        )
-    east, north, up, heading, pitch, roll = map(number, _POSE)
-    world_from_camera = np.eye(4)
-    world_from_camera[:3, :3] = axis_rotation(2, -heading) @ axis_rotation(0, pitch) @ axis_rotation(1, roll)
-    world_from_camera[:3, 3] = east, north, up
-    pose = np.linalg.inv(world_from_camera @ OPENGL_FROM_OPENCV)
-    lens = {key: number(key) for key in _LENS if row.get(key, "").strip()}
-    return RegisteredCamera(name=row["name"].strip(), camera_from_world=pose, focal_35mm=number("f"), lens=lens)
+    else:
+        east, north, up, heading, pitch, roll = map(number, _POSE)
+        world_from_camera = np.eye(4)
+        world_from_camera[:3, :3] = axis_rotation(2, -heading) @ axis_rotation(0, pitch) @ axis_rotation(1, roll)
+        world_from_camera[:3, 3] = east, north, up
+        pose = np.linalg.inv(world_from_camera @ OPENGL_FROM_OPENCV)
+    lens = {key: number(column) for key, column in _TERMS[focal].items() if row.get(column, "").strip()}
+    return RegisteredCamera(
+        name=row["name"].strip(), camera_from_world=pose, focal_35mm=number(focal), lens=lens,
+        in_pixels=focal == "fpix",
+    )  # fmt: skip
 
 
 def _xmp_below(folder: Path, deep: bool = True) -> list[Path]:
