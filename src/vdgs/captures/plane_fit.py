@@ -17,7 +17,7 @@ MOST_PAIRS, MOST_PLACES = 1000, 500
 #: A mirror image explains positions better if the log likelihood is so much larger and the residuals so much smaller.
 MIRRORED_BY, MIRRORED_TIMES = 10.0, 0.7
 #: Cameras that spread across a line by less than so many residuals do not tell (choice).
-ACROSS_TIMES = 1.0
+ACROSS_TIMES = 1.5
 
 
 def mirrored(centers: np.ndarray, targets: np.ndarray, up: np.ndarray, others: dict[str, np.ndarray]) -> str:

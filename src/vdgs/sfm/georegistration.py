@@ -169,11 +169,10 @@ def _deviations(positions: GpsPriors, rows: np.ndarray, stated: bool) -> tuple[n
 
 def _mirrored(fit: PositionFit, problem: Problem, images: Mapping[str, pycolmap.Image], positions: GpsPriors) -> str:
     """Which other reading of the positions alone fits the photographs (`plane_fit.mirrored`); "" where they fit. Up
-    that is not sure counts where the positions contradict it: views that look one way lie on their side by them, or
-    nothing fits."""
+    that is not sure counts where views that look one way lie on their side by the positions."""
     views = np.array([camera_rotation(image) for image in images.values()]) @ fit.similarity.rotation.T
     is_doubted = problem.up.other is not None and fit.similarity.rotation[2] @ problem.up.direction < OTHER_COSINE
-    if not (problem.up.sure or is_doubted or fit.why_refused("") or are_turned_over(views)):
+    if not (problem.up.sure or is_doubted or are_turned_over(views)):
         return ""
     readings = _other_readings(problem.targets, positions.origin)
     return mirrored(problem.centers, problem.targets, problem.up.direction, readings)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vdgs.captures.position_adjustment import Up
-from vdgs.captures.up_axis import up_by_views
+from vdgs.captures.up_axis import OR_CEILING, up_by_views
 from vdgs.geometry.similarity import geometric_median, rotation_to_z
 from vdgs.sfm.attitude_tilt import tilt_of_attitudes
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -59,7 +59,8 @@ def _up_by_attitudes(rotations: np.ndarray, down: np.ndarray, views: Up) -> tupl
     level = rotation_to_z(mean)
     tilt, several, agree = tilt_of_attitudes(rotations @ level.T, down)
     most = max(CONTRADICT_DEG, CONTRADICT_SIGMAS * views.deviation_deg)
-    contradicts = (views.sure or views.other is not None) and not several and min(apart, apart_from_other) > most
+    is_told = views.sure or (views.other is not None and views.other.doubt == OR_CEILING)
+    contradicts = is_told and not several and min(apart, apart_from_other) > most
     if scatter > SCATTER_DEG or contradicts:
         return views, ["the recorded attitudes contradict the photographs: up is taken from the views instead."]
     if views.sure and not several and apart > most:  # the positions tell, as far as they can
