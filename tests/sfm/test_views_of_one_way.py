@@ -125,14 +125,14 @@ def test_positions_that_do_not_spread_are_no_scale():
     assert isinstance(georegister(model, photographs, positions), AlignmentFailure)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_positions_along_a_line_are_not_called_exchanged_by_chance(seed):
-    """A line is its own mirror image, and exchanged axes stretch the errors across it."""
+@pytest.mark.parametrize(("seed", "turn_deg"), [(27, 30.0), (33, 0.0)])
+def test_positions_along_a_line_are_not_called_exchanged_by_chance(seed, turn_deg):
+    """A line is its own mirror image, and exchanged axes stretch the errors across it: of 160 made-up rows these two
+    fit far better with latitude and longitude exchanged."""
     line = np.stack([np.linspace(-14, 14, 12), np.full(12, -18.0), np.full(12, 15.0)], axis=1)
     model, photographs, positions = taken_from(line, wall(), (0.0, 0.0), wrong_m=1.0, recorded=True, seed=seed)
-    for turn in np.radians([0, 30, 60, 90]):
-        turned = positions.enu @ Rotation.from_rotvec([0, 0, turn]).as_matrix().T
-        georegister(model, photographs, replace(positions, enu=turned))
+    turned = positions.enu @ Rotation.from_rotvec([0, 0, turn_deg], degrees=True).as_matrix().T
+    assert isinstance(georegister(model, photographs, replace(positions, enu=turned)), Georegistration)
 
 
 @pytest.mark.parametrize("recorded", [False, True])
