@@ -101,7 +101,7 @@ def test_undistorted_folder_of_odm_is_read_in_its_utm(tmp_path: Path, flight: Kn
 def test_gps_tells_whether_an_odm_project_was_moved_to_utm(
     tmp_path: Path, flight: KnownFlight, in_utm: bool, told_by: str
 ) -> None:
-    """Where neither the topocentric reconstruction nor the report is there; GPS is off by metres."""
+    """Where neither the topocentric reconstruction nor the report is there; GPS is off by metres, one by kilometres."""
     file = writers.write_opensfm(tmp_path / "opensfm", flight)
     flight.write_photographs(tmp_path / "images")
     before = file.read_text()
@@ -109,6 +109,7 @@ def test_gps_tells_whether_an_odm_project_was_moved_to_utm(
     if not in_utm:
         file.write_text(before)
     off = np.random.default_rng(2).normal(0, 3, flight.centers.shape)
+    off[0, 2] += 5000.0 if in_utm else -5000.0  # towards the other reading
     if told_by == "shots":
         content = json.loads(file.read_text())
         for shot, place in zip(content[0]["shots"].values(), flight.centers + off, strict=True):
@@ -118,7 +119,7 @@ def test_gps_tells_whether_an_odm_project_was_moved_to_utm(
         coordinates = tmp_path / "odm_georeferencing" / "coords.txt"
         shift = np.append(np.array(coordinates.read_text().splitlines()[1].split(), float), 0.0)
         gps = writers.utm_flight(flight)[3] - shift + off
-        coordinates.write_text(coordinates.read_text() + "".join(f"{x} {y} {z}\n" for x, y, z in gps))
+        coordinates.write_text(coordinates.read_text() + "".join(f"{x} {y} {z}\n" for x, y, z in gps) + "and words\n")
     source = read(tmp_path, "opensfm")
     check_numbers(source, flight)
     assert not source.warnings

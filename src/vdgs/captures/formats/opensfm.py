@@ -23,6 +23,7 @@ from vdgs.captures.formats.json_poses import parse_number, parse_vector, read_ca
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.gps_tables import check_geodetic
+from vdgs.captures.table_columns import number_of
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -122,13 +123,14 @@ def _read_offset(file: Path) -> _Offset:
     try:
         header, offset, *lines = file.read_text(encoding="utf-8-sig").split("\n")
         shift = np.array([*map(float, offset.split()), 0.0])
-        positions = np.array([[float(word) for word in line.split()] for line in lines if line.strip()])
     except (OSError, ValueError):
-        shift, positions, header = np.zeros(0), np.zeros(0), ""
+        shift, header, lines = np.zeros(0), "", []
     if shift.shape != (3,) or not np.isfinite(shift).all():
         raise CaptureError(f"{file}: must hold a system and an offset of two numbers. Copy it from the project again.")
     change, name = to_geodetic(header, file)
-    known = positions if positions.ndim == 2 and positions.shape[1] == 3 else np.zeros((0, 3))
+    positions = np.array([[number_of(word) for word in line.split()] for line in lines if len(line.split()) == 3])
+    positions = positions.reshape(-1, 3)
+    known = positions[np.isfinite(positions).all(axis=1)]
     return _Offset(file, shift, lambda points: change(points + shift), f"ODM, {name}", known)
 
 
