@@ -10,6 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
+from vdgs.captures.formats.lens_keys import (
+    FOCAL,
+    LENS,
+    OTHER_PARAMETERS,
+    RATIONAL,
+    check_own_matrix,
+    model_of_distortion,
+    with_known_keys,
+    with_nested_model,
+)
 from vdgs.captures.formats.source_capture import (
     BROWN,
     CENTERED,
@@ -134,15 +144,17 @@ def _finite(value: int | float) -> bool:
 
 
 def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: Path) -> Intrinsics:
-    """Intrinsics of a frame, its own keys before the common ones (fl_x, fl_y, cx, cy, w, h, k1...p2).
+    """Intrinsics of a frame, its own keys before the common ones (fl_x, fl_y, cx, cy, w, h, k1...p2, or those of
+    `lens_keys`).
 
     Focal lengths may be given as camera_angle_x, y (radians). Where w and h are absent the image's own
     size is taken, or the multiple of it that cx and cy are the middle of: the file may be of the photographs before
     they were shrunk. Raises `CaptureError` for missing focal lengths and for lenses that are not understood.
     """
-    own = {key: value for key, value in frame.items() if value is not None}
-    replaced = _FOCAL if not _FOCAL.isdisjoint(own) else frozenset()  # a frame's angle says more than a common fl_x
-    values = {**{key: value for key, value in common.items() if key not in replaced}, **own}
+    model = _model(with_nested_model(common) | with_nested_model(frame), file)
+    own, shared = (with_known_keys(each, model in _FISHEYE, file) for each in (frame, common))
+    replaced = FOCAL if not FOCAL.isdisjoint(own) else frozenset()  # a frame's angle says more than a common fl_x
+    values = {**{key: value for key, value in shared.items() if key not in replaced}, **own}
 
     def get(key: str, default: float | None = None) -> float | None:
         value = parse_number(values, key, file)
@@ -155,7 +167,9 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     fx, fy = _focals(get, (width, height), file, image.name)
     # A corner is no principal point: programs that know none write 0.
     head = (fx, fy, get("cx", width / 2) or width / 2, get("cy", height / 2) or height / 2)
-    model, tail = _lens(_camera_model(values, file), _distortion(values, file), file)
+    if not FOCAL.isdisjoint(shared):
+        check_own_matrix(frame, own, (width, height), file)
+    model, tail = _lens(model, _distortion(values, file), values.get(RATIONAL) or (0.0, 0.0, 0.0), file)
     if not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
@@ -208,35 +222,43 @@ _WRITE_SIZE = "Write w and h into the file, or give the photographs of that size
 _SHRUNK, _EXACT, _MIDDLE = (1, *range(2, 17), *(1 / many for many in range(2, 17))), 0.01, 0.06
 #: Doubled, the middle of an image is a whole number of pixels, but for what files round.
 _ROUNDED = 1e-3
-#: Ways to say a focal length, one of which is enough.
-_FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
-_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 #: Camera models that bend by radial and tangential polynomials, if at all, and fisheyes that k1...k4 describe.
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
-#: Parameters of lenses and shutters that other programs write beside those; zero means none.
-_OTHER_PARAMETERS = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "rolling_shutter")
 #: Keys by which instant-ngp names lenses that are no camera model here.
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
 
 
 def _distortion(values: JsonObject, file: Path) -> dict[str, float]:
-    """k1 ... p2, zero where absent, from keys of their own or as nerfstudio's list `distortion_params`."""
-    for key in _OTHER_PARAMETERS:
+    """k1 ... p2, zero where absent."""
+    for key in OTHER_PARAMETERS:
         value = values.get(key)
         if any(each not in (None, 0) for each in (value if isinstance(value, list) else [value])):
             raise CaptureError(f"{file}: the lens parameter {key} is not supported; undistort the images first.")
-    given = values.get("distortion_params")
-    if given is None:
-        return {key: parse_number(values, key, file) or 0.0 for key in _LENS}
-    if not isinstance(given, list) or len(given) != len(_LENS):
-        raise CaptureError(f"{file}: distortion_params must be a list of {', '.join(_LENS)}. Export the file again.")
-    return {key: parse_number({key: value}, key, file) or 0.0 for key, value in zip(_LENS, given, strict=True)}
+    return {key: parse_number(values, key, file) or 0.0 for key in LENS}
 
 
 def _focal(side: float, angle: float | None) -> float | None:
     """Focal length in pixels from the field of view (radians) across a side."""
     return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None
+
+
+def _model(values: JsonObject, file: Path) -> str:
+    """The camera model in capitals, with what a distortion model says: ROS and Kalibr call a fisheye a pinhole whose
+    distortion is equidistant."""
+    model = _camera_model(values, file)
+    if model not in _PERSPECTIVE | _FISHEYE:
+        raise CaptureError(
+            f"{file}: the camera model {model!r} is not supported; undistort the images to PINHOLE first (fisheyes of "
+            f"other models than OPENCV_FISHEYE: colmap image_undistorter).{say_of_panoramas(model)}"
+        )
+    bent = model_of_distortion(values, file)
+    if bent is None or (bent == "OPENCV" and model not in _FISHEYE) or (bent != "OPENCV" and model in _FISHEYE):
+        return model
+    named = str(values.get("camera_model") or "").upper()
+    if bent == "OPENCV_FISHEYE" and named in ("", "PINHOLE", "PERSPECTIVE"):
+        return bent
+    raise CaptureError(f"{file}: the distortion model contradicts the camera model {model}. Remove the wrong one.")
 
 
 def _camera_model(values: JsonObject, file: Path) -> str:
@@ -257,17 +279,14 @@ def _camera_model(values: JsonObject, file: Path) -> str:
     return "OPENCV_FISHEYE"
 
 
-def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float, ...]]:
+def _lens(model: str, k: dict[str, float], divisor: tuple[float, ...], file: Path) -> tuple[str, tuple[float, ...]]:
     """COLMAP's model and its distortion parameters for nerfstudio's keys."""
     if model in _FISHEYE:
         if k["p1"] or k["p2"]:
             raise CaptureError(f"{file}: the lens parameters p1, p2 of a fisheye are not supported; undistort first.")
         return "OPENCV_FISHEYE", (k["k1"], k["k2"], k["k3"], k["k4"])
-    if model not in _PERSPECTIVE:
-        raise CaptureError(
-            f"{file}: the camera model {model!r} is not supported; undistort the images to PINHOLE first (fisheyes of "
-            f"other models than OPENCV_FISHEYE: colmap image_undistorter).{say_of_panoramas(model)}"
-        )
+    if any(divisor):
+        return "FULL_OPENCV", (k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], *divisor)
     if not any(k.values()):
         return "PINHOLE", ()
     if k["k4"]:  # of r^8, as nerfstudio and Metashape, whose k4 its converter writes, have it

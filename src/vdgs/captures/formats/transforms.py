@@ -22,6 +22,7 @@ from vdgs.captures.formats.json_poses import (
     parse_number,
     read_capture_json,
 )
+from vdgs.captures.formats.lens_keys import unread_keys
 from vdgs.captures.formats.listed_names import find_listed
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import (
@@ -88,6 +89,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     photographs = _find_photographs([_file_path(frame, file) for frame in frames], file, root, options)
     names, chosen, notes = photographs.names, photographs.folder, photographs.notes
     splits = _splits(content, names, count, file, options, notes)
+    notes += [f"{file.name}: {note}" for note in unread_keys(content, frames)]
     applied = _parse_applied(content, file)
     views, poses, missing, lost = list[SourceView](), dict[str, np.ndarray](), list[str](), list[str]()
     bad = dict[str, CaptureError]()
