@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import subprocess
 import sys
+import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,7 +17,9 @@ import torch
 from safetensors.torch import save_file
 
 import vdgs
+from support.captures import tiny_scene
 from support.commands import CommandsHere, small_figures
+from support.dataset_layouts import write_transforms
 from support.fake_device import CARD, pretended_card
 from support.small_pipeline import vdgs as verb
 from vdgs.config.presets import PRESETS
@@ -211,6 +215,26 @@ def test_cameras_are_made_of_matrices(run):
             vdgs.cameras_from(poses, intrinsics, 4, 3)
 
 
+def test_doubts_about_a_capture_are_warnings_and_what_cannot_become_a_scene_is_refused(tmp_path):
+    scene = tiny_scene()
+    content = write_transforms(tmp_path, scene)
+    content["frames"][1]["transform_matrix"][0][3] = float("nan")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        capture = vdgs.load_capture(tmp_path)
+    texts = [str(each.message) for each in said]
+    assert any("left out, for the pose cannot be used" in text for text in texts)
+    assert set(capture.warnings) <= set(texts)
+    assert len(set(texts)) == len(texts)
+    assert {(each.filename, each.category) for each in said} == {(__file__, UserWarning)}
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=r"cannot become a scene.*(?s:.)*No training camera sees"):
+        vdgs.load_capture(tmp_path)
+
+
 def test_matrices_that_make_no_camera_are_refused(run):
     camera = run.scene.cameras[1]
     pose = camera.camera_from_world
@@ -229,8 +253,11 @@ def test_matrices_that_make_no_camera_are_refused(run):
     for size in ((160.5, 3), (0, 3), (4, -3), ("4", 3), (4, None)):
         with pytest.raises(VdgsError, match=r"(width|height) is .*it must be (a whole number|at least 1)"):
             vdgs.cameras_from(pose[None], K, *size)
-    with pytest.raises(VdgsError, match="model is 'ortho'; it must be pinhole or orthographic"):
-        vdgs.cameras_from(pose[None], K, 4, 3, model="ortho")
+    with pytest.raises(VdgsError, match="model is 'fisheye'; it must be pinhole or orthographic"):
+        vdgs.cameras_from(pose[None], K, 4, 3, model="fisheye")
+    assert vdgs.cameras_from(pose[None], K, 4, 3, model="ortho")[0].model == "orthographic"
+    with pytest.raises(ValueError, match=r"not \(4, 4\) and \(3, 3\): give viewmats\[None\]"):
+        vdgs.cameras_from(pose, K, 4, 3)
     made = vdgs.cameras_from(pose[None].astype(np.float32), K, np.int64(4), torch.tensor(3))[0]
     assert (made.width, made.height, type(made.width)) == (4, 3, int)
 

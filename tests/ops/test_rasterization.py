@@ -343,6 +343,23 @@ def test_cameras_that_would_be_misread_are_named():
             draw(given | {name: wrong.contiguous()})
 
 
+@pytest.mark.parametrize("kernels", ["native", "twin"])
+def test_gaussians_with_numbers_that_are_not_finite_are_left_out(kernels, request):
+    if kernels == "twin":
+        request.getfixturevalue("twin")
+    given = {name: each for name, each in scene(cameras=1).items() if name != "backgrounds"}
+    shown = draw(given)[2]["gaussian_ids"]
+    rows = torch.arange(len(given["means"])) != shown[0]
+    per_gaussian = ("means", "quats", "scales", "opacities", "colors")
+    without = draw(given | {name: given[name][rows] for name in per_gaussian}, render_mode="RGB+ED")[0]
+    assert not torch.equal(without, draw(given, render_mode="RGB+ED")[0])
+    for name in per_gaussian:
+        for value in (torch.nan, torch.inf):
+            wrong = given[name].clone()
+            wrong[shown[0]] = value
+            assert torch.equal(draw(given | {name: wrong}, render_mode="RGB+ED")[0], without), (name, value)
+
+
 @pytest.mark.parametrize("name", ["width", "height", "tile_size", "sh_degree"])
 @pytest.mark.parametrize("value", ["44", 4.5, -1])
 def test_numbers_that_are_not_whole_are_named(name, value):

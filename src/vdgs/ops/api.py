@@ -190,8 +190,19 @@ def load_capture(path: str | Path, **options: Any) -> Capture:
     """Read and check a capture: a folder with files of COLMAP, nerfstudio, Mega-NeRF, MatrixCity, MVSNet or LLFF.
 
     `options` are those of `CaptureOptions`, as in `vdgs run --help`: images="images_4", downscale=2, test_every=8, ...
-    Raises CaptureError naming the file, the fault and the remedy, VdgsError for an option that does not work.
+    Warns (UserWarning) of what `vdgs run` notes: photographs that are left out, poor points and poses. Pixels are not
+    decoded, and those that are damaged not found.
+    Raises CaptureError naming the file, the fault and the remedy, also where cameras and points cannot become a scene;
+    VdgsError for an option that does not work.
     """
+    from vdgs.captures.validation import require_valid
+
+    capture = _read_capture(path, options)
+    _warn(dict.fromkeys((*capture.warnings, *require_valid(capture).warnings)))
+    return capture
+
+
+def _read_capture(path: str | Path, options: dict[str, Any]) -> Capture:
     from vdgs.captures.loading import load_capture as load
 
     return load(home_path(path), checked_settings(CaptureOptions, options, "CaptureOptions"))
@@ -423,7 +434,8 @@ def train(
     iteration, iterations, loss, psnr in dB, anchors); one that returns True ends the stage early. With `run_dir` it is
     a run folder, which the same call continues after a crash; its blocks train in processes of their own, so it takes
     the capture's folder and no callbacks.
-    `capture_options` say how a folder is read, and go with no `Capture`. Raises CaptureError for a capture that cannot
+    `capture_options` say how a folder is read, and go with no `Capture`. Notes of the stages, and doubts about the
+    capture, are printed on standard error. Raises CaptureError for a capture that cannot
     become a scene, VdgsError for settings, TrainingDiverged.
     """
     from vdgs.pipeline.train_in_memory import train_in_memory, train_in_run_folder
@@ -445,7 +457,7 @@ def train(
     if run_dir is None:
         if isinstance(method, MethodConfig) and method.block.mask_moving == "on":
             raise VdgsError("mask_moving='on' keeps the masks that it makes in a run folder: name one (run_dir)")
-        opened = capture if isinstance(capture, Capture) else load_capture(capture, **vars(settings))
+        opened = capture if isinstance(capture, Capture) else _read_capture(capture, vars(settings))
         return Scene(train_in_memory(opened, method, callbacks, _warning_console(), device), opened)
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
@@ -467,7 +479,7 @@ def view(run: Run | str | Path, *, host: str = "127.0.0.1", port: int | None = N
     view_run(checked_settings(ViewRequest, request, "view"), Console())
 
 
-def _warn(notes: Sequence[str]) -> None:
+def _warn(notes: Iterable[str]) -> None:
     for note in notes:
         warnings.warn(note, stacklevel=3)
 

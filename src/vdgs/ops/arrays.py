@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -83,9 +83,10 @@ def like(given: Any, value: Any) -> Any:
 
 
 def cameras_from(
-    viewmats: Array, Ks: Array, width: int, height: int, *, model: CameraModel = "pinhole"
+    viewmats: Array, Ks: Array, width: int, height: int, *, model: CameraModel | Literal["ortho"] = "pinhole"
 ) -> list[Camera]:
     """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3] in pixels.
+    `model` is pinhole or orthographic, which gsplat calls ortho.
 
     Raises VdgsError for what makes no camera: a pose that is no rotation and translation, intrinsics with skew or of
     another scale, a size that is no whole number. ValueError for other shapes.
@@ -94,11 +95,14 @@ def cameras_from(
         checked_value(name, side, Annotated[int, Range(1, MAX_COUNT)])
         for name, side in (("width", width), ("height", height))
     )
-    model = checked_value("model", model, CameraModel)
+    kind: CameraModel = checked_value("model", "orthographic" if model == "ortho" else model, CameraModel)
     given = (each.detach().cpu().numpy() if isinstance(each, Tensor) else each for each in (viewmats, Ks))
     poses, intrinsics = (np.array(each, np.float64) for each in given)
     if poses.shape[1:] != (4, 4) or intrinsics.shape not in ((3, 3), (len(poses), 3, 3)):
-        raise ValueError(f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}")
+        remedy = ": give viewmats[None] of a single camera" if poses.shape == (4, 4) else ""
+        raise ValueError(
+            f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}{remedy}"
+        )
     for index, pose in enumerate(poses):
         if not is_rigid_motion(pose):
             raise VdgsError(
@@ -110,7 +114,7 @@ def cameras_from(
     return [
         Camera(
             camera_from_world=pose, fx=K[0, 0].item(), fy=K[1, 1].item(), cx=K[0, 2].item(), cy=K[1, 2].item(),
-            width=width, height=height, model=model,
+            width=width, height=height, model=kind,
         )
         for pose, K in zip(poses, np.broadcast_to(intrinsics, (len(poses), 3, 3)), strict=True)
     ]  # fmt: skip

@@ -100,7 +100,8 @@ def rasterization(
       [..., C, D].
 
     Returns the picture [..., C, height, width, X], alpha [..., C, height, width, 1] and `meta`. X is D for `RGB`, 1 for
-    `D` (Σ w z) and `ED` (Σ w z / Σ w), D + 1 for `RGB+D` and `RGB+ED`. `meta` has gsplat's keys but those of its tiles
+    `D` (Σ w z) and `ED` (Σ w z / Σ w, 0 where nothing is drawn), D + 1 for `RGB+D` and `RGB+ED`. Gaussians
+    with a number that is not finite are left out. `meta` has gsplat's keys but those of its tiles
     (`tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`): batch_ids, camera_ids, gaussian_ids, radii (px),
     means2d (px), depths, conics, opacities, width, height, tile_size, tile_width, tile_height, n_batches, n_cameras;
     their rows are those drawn (`packed`), or they are [..., C, N, ...]. `means2d.retain_grad()` gives densification its
