@@ -23,6 +23,7 @@ from vdgs.captures.optional_decoders import INSTALL
 from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER
 from vdgs.captures.strays import MASKED, is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
+from vdgs.sfm.picture_layers import picture_layers
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.quoting import check_is_text
 from vdgs.system.units import first_names
@@ -151,7 +152,9 @@ def find_files(folders: Sequence[Path]) -> Found:
                         _add(found, path, prefix + path.relative_to(folder).as_posix(), stems)
                 elif not (is_film(path) and str(path.resolve()) in used):
                     _count_other(found, path, stems)
-    found.named = dict(sorted(found.named.items()))
+    layers = picture_layers(found.named)
+    found.left_out |= layers
+    found.named = {name: path for name, path in sorted(found.named.items()) if name not in layers}
     return found
 
 
