@@ -10,6 +10,7 @@ import pytest
 
 from support.dataset_layouts import write_transforms
 from vdgs.captures.formats.json_poses import parse_intrinsics
+from vdgs.captures.formats.opensfm import _intrinsics as opensfm_lens
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError
@@ -141,3 +142,11 @@ def test_what_may_be_of_a_lens_and_is_not_read_is_named(tmp_path, scene):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     (said,) = [each for each in load_capture(tmp_path).warnings if "not read" in each]
     assert said.startswith("transforms.json: 'cameras', 'fov': not read")
+
+
+@pytest.mark.parametrize(("kind", "term"), [("perspective", "k3"), ("fisheye_opencv", "p1"), ("brown", "s1")])
+def test_terms_that_a_projection_of_opensfm_has_not_are_named(kind, term):
+    camera = {"projection_type": kind, "width": 64, "height": 48, "focal": 0.8, "k1": -0.1}
+    assert isinstance(opensfm_lens(camera | {term: 0.0}, "one", Path("a.json")), Intrinsics)
+    said = opensfm_lens(camera | {term: 0.1}, "one", Path("a.json"))
+    assert said == f"the lens parameter {term} of the camera 'one', of a projection '{kind}', is not supported"

@@ -344,6 +344,20 @@ def test_a_lens_of_meshroom_that_is_not_read_is_named(tmp_path: Path, flight: Kn
         read(tmp_path, "alicevision")
 
 
+def test_a_lens_of_meshroom_with_more_terms_than_its_model_is_refused(tmp_path: Path, flight: KnownFlight) -> None:
+    file = writers.write_alicevision(tmp_path, flight)
+    flight.write_photographs(tmp_path / "images")
+    content = json.loads(file.read_text())
+    terms = content["intrinsics"][0]["distortionParams"]
+    terms += ["0"] * (6 - len(terms))
+    file.write_text(json.dumps(content))
+    read(tmp_path, "alicevision")
+    terms[-1] = "0.1"
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=r"lens 7 has 6 terms of distortion, more than its model"):
+        read(tmp_path, "alicevision")
+
+
 @pytest.mark.parametrize("program", ["pix4d", "opf"])
 def test_heights_of_pix4d_have_the_unit_of_its_system(tmp_path: Path, flight: KnownFlight, program: str) -> None:
     """The system has no heights; x, y and z of a camera model have one unit."""

@@ -8,6 +8,7 @@ world over it, UTM minus an offset, and keeps this one as reconstruction.topocen
 from __future__ import annotations
 
 import json
+import re
 from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -51,6 +52,8 @@ _TWO_FOCALS = {
     "brown": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "", "", "")),
     "fisheye_opencv": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
+#: Names of distortion: radial, tangential, of thin prisms.
+_TERM = re.compile(r"[kps]\d+")
 
 
 def find_files(root: Path) -> list[Path]:
@@ -231,6 +234,9 @@ def _intrinsics(camera: JsonObject, name: str, file: Path) -> Intrinsics | str:
         raise CaptureError(f"{file}: the camera {name!r} has an image size of {width:g}x{height:g}. {_AGAIN}")
     longer = max(width, height)
     model, keys = _ONE_FOCAL.get(kind) or _TWO_FOCALS[kind]
+    others = [key for key in camera if _TERM.fullmatch(key) and key not in keys and get(key)]
+    if others:
+        return f"the lens parameter {others[0]} of the camera {name!r}, of a projection {kind!r}, is not supported"
     focal = (get("focal"),) if kind in _ONE_FOCAL else (get("focal_x") or get("focal"), get("focal_y") or get("focal"))
     center = (get("c_x") * longer + width / 2, get("c_y") * longer + height / 2)
     params = (*(longer * each for each in focal), *center, *map(get, keys))

@@ -277,6 +277,8 @@ def _lens(
     width, height = (int(parse_number(sized, key, file) or 0) for key in ("width", "height"))
     bends = bends if isinstance(bends, list) else []
     terms = parse_vector(bends, len(bends), file, f"{label}: its distortion").tolist()
+    if any(terms[4 if kind == "fisheye" else 5 :]):
+        raise CaptureError(f"{file}: {label} has {len(terms)} terms of distortion, more than its model. {_AGAIN}")
     if kind == "fisheye":
         lens = Intrinsics("OPENCV_FISHEYE", (*focal, *center, *[*terms, *[0.0] * 4][:4]), width, height)
     else:
