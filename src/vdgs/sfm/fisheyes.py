@@ -102,8 +102,11 @@ def compare(
 
 
 def stretched(model: pycolmap.Reconstruction, ratio: float) -> pycolmap.Reconstruction:
-    """A model so many times as deep along the mean view: a focal length that is too short by that makes it shallow."""
+    """A model so many times as deep along the mean view: a focal length that is too short by that makes it shallow. As
+    it is where cameras are held together by rigs."""
     deep = pycolmap.Reconstruction(model)
+    if any(rig.num_sensors() > 1 for rig in deep.rigs.values()):
+        return deep
     images = placed_images(deep)
     axis = np.mean([image.cam_from_world().rotation.matrix()[2] for image in images], axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)
