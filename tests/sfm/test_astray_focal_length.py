@@ -95,7 +95,7 @@ def test_a_focal_length_that_is_released_and_goes_astray_is_held_again(monkeypat
         def fit(model, _threads, focal=focal):
             model.cameras[1].focal_length = focal
 
-        monkeypatch.setattr(incremental_mapper, "_fit_focal", fit)
+        monkeypatch.setattr(incremental_mapper, "fit_focal", fit)
         assert incremental_mapper.release_focal(models, (True, OF_FLIGHTS), [GROUP], 1) == held
         assert models[0].cameras[1].focal_length == FOCAL
 

@@ -46,6 +46,12 @@ class CameraReport:
     focal_source: str
     focal_after_px: float
     radial_distortion: float
+    model: str = "SIMPLE_RADIAL"
+    """COLMAP's, of the lens as it was fitted."""
+
+    @property
+    def is_fisheye(self) -> bool:
+        return "FISHEYE" in self.model
 
 
 @dataclass(frozen=True)
@@ -228,7 +234,8 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
         rows.append(
             (
                 "Lens",
-                f"{camera.name}: focal length {camera.focal_before_px:.0f} px by {camera.focal_source}, "
+                f"{camera.name}: {'fisheye, ' if camera.is_fisheye else ''}focal length "
+                f"{camera.focal_before_px:.0f} px by {camera.focal_source}, "
                 f"{camera.focal_after_px:.0f} px now ({held}: {metadata.focal_reason}), k "
                 f"{camera.radial_distortion:+.4f}",
             )

@@ -23,9 +23,9 @@ class SfmOptions:
     tell it from the height (straight down from one height, by what the drone recorded or by level positions all over an
     area) and where the maker calibrated it; fitted otherwise."""
     camera_model: CameraModel = "auto"
-    """How lenses bend. auto: one radial term, a fisheye's four where EXIF's name of the lens says so, and panoramas of
-    360° by their XMP; opencv: two radial and two tangential terms; equirectangular: every photograph twice as wide as
-    high is a panorama of 360°."""
+    """How lenses bend. auto: one radial term, a fisheye's four where EXIF's name of the lens says so, or where the
+    photographs do (of lenses up to 20 mm, 35 mm equivalent), and panoramas of 360° by their XMP; opencv: two radial and
+    two tangential terms; equirectangular: every photograph twice as wide as high is a panorama of 360°."""
     brackets: Brackets = "middle"
     """Which exposures of a bracket (AEB) are used. middle: the middle one of those of one place and moment, by EXIF;
     all: every photograph."""

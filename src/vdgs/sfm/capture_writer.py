@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +31,8 @@ SIDE_MULTIPLE = 4
 #: The folders of the sizes, and by how much they are shrunk.
 IMAGE_SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
 JPEG_QUALITY = 95
+#: No perspective lens sees more degrees from corner to corner: those of 9 mm for 36 x 24 mm see 135.
+WIDEST_DEG = 138.0
 #: The folder of masks, of the largest size.
 MASK_FOLDER = CaptureOptions.masks
 IMAGE_FOLDERS = (*(folder for folder, _ in IMAGE_SIZES), MASK_FOLDER)
@@ -255,11 +258,26 @@ def _is_of_rig(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
 
 def is_impossible(camera: pycolmap.Camera) -> bool:
     """Whether there is no such lens."""
-    return not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0)
+    bogus = not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0)
+    return bogus or _perspective_deg(camera) > WIDEST_DEG
+
+
+def _perspective_deg(camera: pycolmap.Camera) -> float:
+    """How far a perspective lens of this focal length sees from corner to corner, degrees; 0 for a fisheye."""
+    if "FISHEYE" in camera.model_name:
+        return 0.0
+    return 2 * math.degrees(math.atan2(math.hypot(camera.width, camera.height) / 2, camera.mean_focal_length()))
 
 
 def fitted_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     """The lens of a camera. Raises CaptureError for one that there is not."""
+    seen = _perspective_deg(camera)
+    if is_impossible(camera) and seen > WIDEST_DEG:
+        raise CaptureError(
+            f"the fitted lens of a camera ({camera.params_to_string()}) would see {seen:.0f}° from corner to corner, "
+            f"and perspective lenses end at {WIDEST_DEG:.0f}°: if it is a fisheye, say it: --camera-model "
+            "opencv-fisheye"
+        )
     if is_impossible(camera):
         raise CaptureError(
             f"the fitted lens of a camera ({camera.params_to_string()}) is none that there is: the photographs do not "

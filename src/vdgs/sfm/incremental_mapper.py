@@ -162,7 +162,7 @@ def release_focal(
     if _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE:
         return True, "level strips, as the photographs themselves show, whatever their altitudes say"
     as_held = pycolmap.Reconstruction(model)
-    _fit_focal(model, threads)
+    fit_focal(model, threads)
     if is_astray(model, (False, OF_SHAPE), groups) and is_held_as_good([as_held], models):
         models[0] = as_held
         return True, CONFIRMED
@@ -180,7 +180,7 @@ def is_contradicted(
     fitted = pycolmap.Reconstruction(model)
     fitted.update_point_3d_errors()
     as_held = mean_reprojection_error(fitted)
-    _fit_focal(fitted, threads)
+    fit_focal(fitted, threads)
     nearer = 1 - mean_reprojection_error(fitted) / as_held
     return nearer >= CLEARLY_NEARER and any(
         not alike(fitted.cameras[k].mean_focal_length(), focal) for k, focal in said.items() if k in fitted.cameras
@@ -219,7 +219,7 @@ def is_held_as_good(held: Sequence[pycolmap.Reconstruction], fitted: Sequence[py
     return placed >= before and mean_reprojection_error(held[0]) <= allowed
 
 
-def _fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
+def fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
     """Fit the focal lengths of a model, with all else that is fitted."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary, options.ceres.solver_options.num_threads = False, threads

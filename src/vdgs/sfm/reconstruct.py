@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +34,7 @@ from vdgs.sfm import (
     capture_writer,
     feature_extraction,
     feature_matching,
+    fisheyes,
     global_mapper,
     incremental_mapper,
     mask_files,
@@ -350,12 +352,39 @@ def _mapped(
     count: int,
     console: Console,
 ) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
-    """The models, and whether the focal length was held and why; anew where the first show that it must not be, or
-    must be."""
+    """The models, and whether the focal length was held and why; anew where the first show that lenses are fisheyes."""
+    found = fisheyes.read_found(workspace, key)
+    if not found and workspace.fisheyes_file.exists():  # found among other pairs, or by another focal length
+        fisheyes.use_lenses(workspace, kinds, key, plan.threads, console)
+        workspace.fisheyes_file.unlink()
+    first = list[pycolmap.Reconstruction]()
+    if not found and plan.request.options.camera_model == "auto" and not _is_begun_anew(workspace, key):
+        first, found = _find_fisheyes(plan, workspace, kinds, key, count, console)
+    if not found:
+        return _mapped_as_told(plan, workspace, kinds, key, count, console, first)
+    names = {photo.name for number in found for photo in kinds[number - 1].images}
+    photographs = fisheyes.with_fisheyes(plan.image_list.images, names)
+    plan = replace(plan, image_list=replace(plan.image_list, images=tuple(photographs)))
+    kinds = feature_extraction.group_by_camera(photographs)
+    fisheyes.use_lenses(workspace, kinds, key, plan.threads, console)
+    return _mapped_as_told(plan, workspace, kinds, f"{key}, fisheyes", count, console)
+
+
+def _mapped_as_told(
+    plan: ReconstructionPlan,
+    workspace: Workspace,
+    kinds: Sequence[feature_extraction.CameraGroup],
+    key: str,
+    count: int,
+    console: Console,
+    first: list[pycolmap.Reconstruction] | None = None,
+) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
+    """The models by these lenses, and whether the focal length was held and why; anew where the first, which may be
+    given, show that it must not be, or must be."""
     meant = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)
-    fitting, holding = f"{key}, focal length fitted", f"{key}, focal length held"
-    if not any(workspace.is_begun("model", anew) for anew in (fitting, holding)):
-        models = _models(plan, workspace, key, count, meant[0], console)
+    fitting, holding = _keys_anew(key)
+    if not _is_begun_anew(workspace, key):
+        models = first or _models(plan, workspace, key, count, meant[0], console)
         held = incremental_mapper.release_focal(models, meant, kinds, plan.threads)
         if workspace.is_done("focal", key):
             return models, held
@@ -371,6 +400,50 @@ def _mapped(
     if not meant[0]:
         return _held_anew(plan, workspace, holding, count, meant, console)
     return _models(plan, workspace, fitting, count, False, console), (False, incremental_mapper.CONTRADICTED)
+
+
+def _keys_anew(key: str) -> tuple[str, str]:
+    """Of models that are made anew with the focal length fitted, and held."""
+    return f"{key}, focal length fitted", f"{key}, focal length held"
+
+
+def _is_begun_anew(workspace: Workspace, key: str) -> bool:
+    return any(workspace.is_begun("model", anew) for anew in _keys_anew(key))
+
+
+def _find_fisheyes(
+    plan: ReconstructionPlan,
+    workspace: Workspace,
+    kinds: Sequence[feature_extraction.CameraGroup],
+    key: str,
+    count: int,
+    console: Console,
+) -> tuple[list[pycolmap.Reconstruction], list[int]]:
+    """The models with lenses as tags say them, and the numbers of cameras that they show to be fisheyes; all that may
+    be where there is no model."""
+    held = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)[0]
+    try:
+        models = _models(plan, workspace, key, count, held, console)
+    except CaptureError as error:
+        models, found = [], fisheyes.candidates(kinds)
+        if not found:
+            raise
+        why = f"with perspective lenses: {error} Now with fisheyes, all anew"
+    else:
+        if workspace.is_done("focal", key):  # looked at before
+            return models, []
+        found = fisheyes.candidates(kinds, models[0])
+        errors = fisheyes.compare(models[0], kinds, found, plan.threads)
+        if errors is None:
+            return models, []
+        names = ", ".join(dict.fromkeys(kinds[number - 1].camera for number in found))
+        why = (
+            f"{names}: a fisheye, as the photographs tell: points lie {errors[1]:.2g} px from where they are seen, "
+            f"{errors[0]:.2g} px with a perspective lens; mapped so, all anew"
+        )
+    console.print(f"[yellow]note[/] {escape(why)}", highlight=False)
+    fisheyes.write_found(workspace, key, found)
+    return models, found
 
 
 def _held_anew(

@@ -22,7 +22,7 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
 from vdgs.kernels import default_num_threads
-from vdgs.sfm import feature_matching, flights, incremental_mapper
+from vdgs.sfm import feature_matching, fisheyes, flights, incremental_mapper
 from vdgs.sfm.console_report import print_preflight
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors, read_gps_priors
@@ -145,6 +145,7 @@ def print_plan(reconstruction_plan: ReconstructionPlan, takes: str, console: Con
         f"features, about {reconstruction_plan.pairs} pairs ({how}), poses and points, {meters}photographs without "
         "distortion",
         *_gcp_plan_lines(reconstruction_plan.gcps),
+        *fisheyes.foretold(photographs, options),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
         *([takes] if takes else []),
     ]

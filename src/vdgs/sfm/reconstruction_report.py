@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,13 @@ from vdgs.sfm.attitude_tilt import tilt_of_views
 from vdgs.sfm.camera_rigs import describe_rigs
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
+from vdgs.sfm.fisheyes import MAX_FISHEYE_MM, equivalent_mm
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
 from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import RADIAL, ImageMetadata
 from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
 from vdgs.sfm.preflight import (
     LEVEL_TILT_DEG,
@@ -75,7 +76,12 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     tilt = tilt_of_views(np.array([image.cam_from_world().rotation.matrix() for image in images])) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, result.found.photographs) if metric else None
-    warnings = [*look.warnings, *result.found.notes, *_warnings(cameras, held, height, look.height_m, turned, tilt)]
+    untold = {kind.camera for kind in result.camera_groups if kind.model == RADIAL}
+    warnings = [
+        *look.warnings,
+        *result.found.notes,
+        *_warnings(cameras, held, height, look.height_m, turned, tilt, untold),
+    ]
     if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions with altitudes
         up = placed.residuals[:, 2]
         names = [collection.images[int(positions.image_indices[row])].name for row in placed.position_rows]
@@ -186,6 +192,7 @@ def cameras_of(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> 
             focal_source=kind.source,
             focal_after_px=float(after.mean_focal_length()),
             radial_distortion=float(next(iter(after.params[after.extra_params_idxs()]), 0.0)),
+            model=after.model_name,
         )
         for kind, after in zip(kinds, refined_cameras(model, kinds), strict=True)
         if after is not None
@@ -212,13 +219,24 @@ def _warnings(
     recorded: float | None,
     turned: float | None,
     tilt: float | None,
+    untold: Collection[str] = (),
 ) -> list[str]:
     found = []
     for camera in cameras:
+        if camera.is_fisheye and camera.name in untold:
+            found.append(
+                f"{camera.name}: a fisheye, as the photographs tell; no tag says it. If it is none: --camera-model "
+                "simple-radial"
+            )
         drift = camera.focal_after_px / camera.focal_before_px - 1
         if not held[0] and camera.focal_source != "a guess" and abs(drift) > MAX_FOCAL_DRIFT:
             remedy = "; if heights look wrong, hold it: --focal fixed"
-            if held[1] == CONTRADICTED:
+            if not camera.is_fisheye and _is_short(camera):
+                remedy = (
+                    ". Lenses so short may be fisheyes: say it (--camera-model opencv-fisheye). Or did a program "
+                    "shrink them and rewrite their size (PixelXDimension)? Mend EXIF"
+                )
+            elif held[1] == CONTRADICTED:
                 remedy = (
                     ", which the photographs contradict. Did a program shrink them and rewrite their size "
                     "(PixelXDimension)? Mend EXIF, or hold what it says: --focal fixed"
@@ -242,6 +260,12 @@ def _warnings(
     if turned is not None and turned > MAX_TILT_DEG:
         found.append(f"down differs by {turned:.1f}° from what the drone recorded: the model may be tilted or bent.")
     return found
+
+
+def _is_short(camera: CameraReport) -> bool:
+    """Whether a lens may be a fisheye by its focal length, as tags say it or as it was fitted."""
+    shorter = min(camera.focal_before_px, camera.focal_after_px)
+    return equivalent_mm(shorter, camera.width, camera.height) <= MAX_FISHEYE_MM
 
 
 def _lens_warnings(photographs: Sequence[ImageMetadata], off_m: Mapping[str, float], height: float) -> list[str]:

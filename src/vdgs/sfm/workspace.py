@@ -90,6 +90,11 @@ class Workspace:
         return self.path / "fitted"
 
     @property
+    def fisheyes_file(self) -> Path:
+        """The cameras that are fisheyes as the photographs tell, while no tag says it."""
+        return self.path / "fisheyes.json"
+
+    @property
     def snapshots(self) -> Path:
         """Where the mapper writes what it has from time to time; whole only once it goes on."""
         return self.path / "snapshots"
