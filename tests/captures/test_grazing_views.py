@@ -9,10 +9,12 @@ import pytest
 
 from support.captures import look_down
 from support.flown_captures import camera, capture_of, facade, nadir, plane
+from vdgs.captures.camera_height import height_range
 from vdgs.captures.capture import Capture
 from vdgs.captures.grazing_views import grazing_note, grazing_share
 from vdgs.captures.place_facts import measure_place
 from vdgs.captures.place_record import place_rows
+from vdgs.captures.reconstruction import flying_height
 
 
 def rings(*radii_heights: tuple[float, float], half: float = 120) -> Capture:
@@ -63,3 +65,11 @@ def test_a_pixel_is_that_of_what_photographs_look_at():
     assert row(rings((66, 26)), "Pixel of the photographs").startswith("0.236 units on what all of them look at")
     assert " on the ground " in row(nadir(), "Pixel of the photographs")
     assert " on what they show (median) " in row(facade(), "Pixel of the photographs")
+
+
+def test_rings_at_two_heights_are_said_before_and_after_the_reconstruction():
+    assert height_range([28.0] * 20 + [62.0] * 14) == (28, 62)
+    assert height_range([45.0, 46.5, 44.0, 50.0]) is None
+    assert height_range([60.0] * 39 + [2.0]) is None  # one on the ground
+    assert flying_height(27.7, (27.6, 61.8)) == "27.7 m (median; 27.6 to 61.8 m)"
+    assert flying_height(45.0, None) == "45.0 m"
