@@ -3,59 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from support.captures import look_down
-from vdgs.captures.capture import Capture, View
+from support.flown_captures import camera, capture_of, facade, nadir, plane
+from vdgs.captures.capture import Capture
 from vdgs.captures.first_view import FOV_DEG, DefaultView, default_view
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.rendering.camera_paths import look_at_pose
-
-
-def camera(place: Sequence[float], tilt: float, heading: float) -> Camera:
-    pose = look_down(np.array(place, float), tilt, heading)
-    return Camera(camera_from_world=pose, fx=300.0, fy=300.0, cx=200.0, cy=150.0, width=400, height=300)
-
-
-def capture_of(cameras: Sequence[Camera], points: np.ndarray) -> Capture:
-    views = tuple(
-        View(name=f"{k}.png", camera=each, image_path=Path(f"{k}.png"), mask_path=None, split="train")
-        for k, each in enumerate(cameras)
-    )
-    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=False, description="as it is")
-    return Capture(
-        root=Path(), source="colmap", images="images", views=views, points=points,
-        point_colors=np.zeros((len(points), 3), np.uint8), ground=frame,
-    )  # fmt: skip
-
-
-def plane(width: float, length: float) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    return np.column_stack([*rng.uniform((-width, -length), (width, length), (900, 2)).T, rng.uniform(0, 4, 900)])
-
-
-def nadir(width: float = 60.0, length: float = 60.0) -> Capture:
-    places = [(x, y, 50.0) for x in np.arange(-width, width + 1, 20) for y in np.arange(-length, length + 1, 20)]
-    return capture_of([camera(place, 0.0, 0.0) for place in places], plane(width, length))
 
 
 def oblique() -> Capture:
     """From the north-west alone, looking down by 45 degrees to the south-east."""
     places = [(x, y, 50.0) for x in np.arange(-100, 21, 20) for y in np.arange(-20, 101, 20)]
     return capture_of([camera(place, 45.0, 135.0) for place in places], plane(60, 60))
-
-
-def facade() -> Capture:
-    """A wall that faces the north, photographed level from there."""
-    rng = np.random.default_rng(1)
-    wall = np.column_stack([rng.uniform(-20, 20, 900), rng.uniform(0, 0.5, 900), rng.uniform(0, 15, 900)])
-    cameras = [camera((x, 18.0, z), 90.0, 180.0) for x in range(-20, 21, 5) for z in (3.0, 8.0, 12.0)]
-    return capture_of(cameras, wall)
 
 
 def upside_down() -> Capture:
@@ -165,3 +128,18 @@ def test_there_is_a_look_without_points_that_two_photographs_show():
     look = default_view(capture_of([camera((0, 0, 50), 0, 0), camera((500, 0, 50), 0, 0)], np.zeros((1, 3))))
     assert np.isfinite(look.position).all()
     assert np.linalg.norm(look.position - look.target) > 1
+
+
+def test_where_views_converge_the_first_look_is_at_that_and_not_at_all_ground_behind_it():
+    rng = np.random.default_rng(3)
+    tower = rng.uniform((-5, -5, 0), (5, 5, 41), (600, 3))
+    angles = np.arange(24) * np.pi / 12
+    poses = [look_at_pose(np.array([66 * np.cos(a), 66 * np.sin(a), 40]), np.array([0.0, 0.0, 17.0])) for a in angles]
+    ring = [replace(camera((0, 0, 0), 0, 0), camera_from_world=pose) for pose in poses]
+    flown = capture_of(ring, np.concatenate([plane(150, 150), tower]))
+    look, whole = default_view(flown), default_view(flown, whole=True)
+    assert shown(look, tower).all()
+    near, far = (np.linalg.norm(each.position - (0, 0, 17)) for each in (look, whole))
+    assert near < 100
+    assert far > 200
+    assert shown(whole, flown.points).mean() > 0.95

@@ -181,3 +181,13 @@ def test_without_rasterio_the_remedy_is_named(house, make, monkeypatch):
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(VdgsError, match=r"pip install 'vdgs\[geo\]'"):
         make(*house)
+
+
+def test_maps_of_views_at_grazing_angles_say_that_they_are_rough(house, make, capsys, monkeypatch):
+    monkeypatch.setattr(ortho_plan, "grazing_share", lambda _: 0.56)
+    folder = make(*house, gsd=0.5)
+    record = json.loads((folder / "map.json").read_text())
+    assert record["seen_at_grazing_angles_share"] == 0.56
+    (note,) = (each for each in record["notes"] if "straight down" in each)
+    assert note.startswith("56% of the ground")
+    assert note in " ".join(capsys.readouterr().err.split())

@@ -452,3 +452,29 @@ def test_a_flyover_of_one_camera_stands_still():
     path = flyover(strips(1, 1), TEMPLATE, seconds=0.2, fps=25.0)
     assert len(path.cameras) == 5
     assert all(is_rigid(camera) for camera in path.cameras)
+
+
+def rings() -> list[Camera]:
+    """Around a tower of 41 m at two heights, then away and home."""
+    places = [(r * np.cos(a), r * np.sin(a), z) for r, z in ((66, 28), (56, 62)) for a in np.arange(18) * np.pi / 9]
+    home = [standing([100 + 10 * k, 0, 60], [200 + 10 * k, 0, 50]) for k in range(6)]
+    return [standing(place, [0, 0, 17]) for place in places] + home
+
+
+@pytest.mark.parametrize("made", [orbit, flyover])
+def test_films_look_at_what_photographs_converge_on_from_as_far_as_they_were(made):
+    cameras = rings()
+    template = Camera(camera_from_world=np.eye(4), fx=136.0, fy=136.0, cx=80.0, cy=60.0, width=160, height=120)
+    ground = np.random.default_rng(2).uniform([-150, -150, -1], [150, 150, 1], (500, 3))
+    path = made(*([ground] if made is orbit else []), cameras, template, seconds=2.0, fps=10.0)
+    assert path.converged is not None
+    for camera in path.cameras:
+        pixels, depth = camera.project(np.array([[0, 0, 17.0], [0, 0, 0], [0, 0, 41]]))
+        np.testing.assert_allclose(pixels[0], [80, 60], atol=0.5)
+        assert camera.holds(pixels, depth).all()  # from its foot to its top
+        assert 63 < depth[0] < 73
+
+
+def test_a_survey_has_no_place_that_films_look_at():
+    assert flyover(strips(), TEMPLATE, seconds=0.2).converged is None
+    assert orbit(np.zeros((1, 3)), strips(), TEMPLATE, seconds=0.2).converged is None

@@ -170,3 +170,14 @@ def test_what_is_right_or_asked_for_is_mapped_once(tmp_path, monkeypatch, focal,
         assert model.cameras[1].focal_length == fitted
         assert "anew" not in said
     assert mapper.made == [False]
+
+
+def test_fitting_the_focal_length_leaves_the_log_of_colmap_silent(capfd):
+    silence_colmap()
+    model = model_of(images=4)
+    before = model.cameras[1].focal_length
+    model.cameras[1].focal_length = 1.05 * before
+    incremental_mapper._fit_focal(model, 1)
+    assert model.cameras[1].focal_length == pytest.approx(before, rel=0.02)
+    pycolmap.logging.info("told")
+    assert capfd.readouterr() == ("", "")

@@ -244,3 +244,22 @@ def test_rounded_altitudes_count_as_errors_and_do_not_let_the_focal_length_be_fi
     assert should_fix_focal(photos, priors, SfmOptions())[0]
     alike = read_gps_priors([replace(photo, altitude=500.0) for photo in photos], None, (1.0, 2.0))
     assert alike.altitude_step_m == 0  # one height, as planned
+
+
+@pytest.mark.parametrize(
+    ("altitudes", "seen"),
+    [
+        ([528] * 20 + [562] * 14, 0),  # two rings
+        ([512] * 8 + [530] * 8 + [528] * 7 + [512] * 8 + [530] * 8, 0),  # both sides of a bridge, and its end
+        ([510, 520, 530, 530, 520, 510] * 5, 0),  # up and down a wall
+        ([510, 520, 530, 540, 550, 550, 540, 530, 520, 510] * 3, 10),
+        ([100] * 6 + [101] + [100] * 5 + [99] + [100] * 9, 1),
+        ([560] * 12 + [570] * 3 + [560] * 12, 0),
+    ],
+)
+def test_few_levels_are_not_altitudes_that_were_rounded(first, altitudes, seen):
+    photos = [
+        replace(first, name=f"{k}", lat_lon=(-33.5 + 1e-4 * k, -70.6 + 1e-4 * (k % 5)), altitude=float(each))
+        for k, each in enumerate(altitudes)
+    ]
+    assert read_gps_priors(photos, None, (1.0, 2.0)).altitude_step_m == seen

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Float
 
 from vdgs.captures.capture import Capture
@@ -17,6 +18,9 @@ from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.similarity import geometric_median
 
+#: Cameras fly at several heights where all but the lowest and highest 5 % of them differ by more than this share of the
+#: median (choice: more than a flight along one height over hills).
+SEVERAL_HEIGHTS_SHARE = 0.25
 #: Cameras that are no higher above the points than this share of their distance to them fly at no height (choice).
 MIN_HEIGHT_RATIO = 0.02
 
@@ -36,6 +40,16 @@ def view_distance(
     height = float(np.median(centers @ up) - np.median(points @ up))
     distance = float(np.median(np.linalg.norm(centers - geometric_median(points), axis=1)))
     return ViewDistance(height, True) if height > MIN_HEIGHT_RATIO * distance else ViewDistance(distance, False)
+
+
+def height_range(heights: npt.ArrayLike) -> tuple[float, float] | None:
+    """The lowest and the highest of heights [n], without 5 % on each side; None where one height, their median, says
+    it all."""
+    values = np.asarray(heights, np.float64)
+    if not len(values):
+        return None
+    low, high = (float(each) for each in np.quantile(values, (0.05, 0.95), method="nearest"))
+    return (low, high) if high - low > SEVERAL_HEIGHTS_SHARE * abs(float(np.median(values))) else None
 
 
 def offset_rate_factor(capture: Capture, config: TrainConfig) -> float:

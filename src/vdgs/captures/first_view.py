@@ -13,6 +13,7 @@ from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, spread_evenly
 from vdgs.captures.scene_points import MIN_SEEN_BY, scene_points
 from vdgs.geometry.similarity import sample_points
+from vdgs.geometry.view_convergence import Convergence, find_convergence
 
 #: Vertical angle of view of a first look (choice).
 FOV_DEG = 50.0
@@ -21,6 +22,8 @@ FOV_DEG = 50.0
 _TRIM_QUANTILE, _FILLED_SHARE = 0.003, 0.8
 #: Points by which the scene is found, points and cameras by which directions are compared.
 _MAX_SCENE_POINTS, _MAX_POINTS, _MAX_CAMERAS = 5000, 300, 60
+#: Fewer points say nothing of where the scene is.
+_MIN_POINTS = 10
 #: The picture is framed by the points that so many training cameras see, where these are the half of all.
 _TRUSTED_SEEN_BY = 3
 #: Directions that are compared, in degrees.
@@ -40,12 +43,16 @@ class DefaultView(NamedTuple):
     target: Float[np.ndarray, "3"]
 
 
-def default_view(capture: Capture) -> DefaultView:
+def default_view(capture: Capture, whole: bool = False) -> DefaultView:
     """What at least three training cameras see of the scene, seen half from above where cameras looked that way, else
-    from the nearest direction in which cameras looked: the direction of the least cost (`_COST_OF_ELEVATION`)."""
-    known, trusted = (scene_points(capture, _MAX_SCENE_POINTS, each) for each in (MIN_SEEN_BY, _TRUSTED_SEEN_BY))
-    points = _trimmed(trusted if 2 * len(trusted) >= len(known) else known)
-    if len(points) < 10:
+    from the nearest direction in which cameras looked: the direction of the least cost (`_COST_OF_ELEVATION`). Where
+    their views converge on a place (`geometry.view_convergence`), of that what is about it, unless the `whole` is
+    asked for."""
+    converged = None if whole else find_convergence([view.camera for view in capture.train_views])
+    points = _trimmed(_shown(capture, converged))
+    if converged is not None and len(points) < _MIN_POINTS:
+        points = _trimmed(_shown(capture, None))
+    if len(points) < _MIN_POINTS:
         points = capture.points if len(capture.points) else np.zeros((1, 3))
     support = _Support(capture, sample_points(points, _MAX_POINTS))
     nearest = 0.5 * camera_height(capture)
@@ -64,6 +71,13 @@ def default_view(capture: Capture) -> DefaultView:
                 best, least = look, cost
     assert best is not None  # from 80 degrees every look is above the ground
     return best
+
+
+def _shown(capture: Capture, converged: Convergence | None) -> Float[np.ndarray, "n 3"]:
+    """The points that the picture is to hold."""
+    about = None if converged is None else (converged.place, converged.radius)
+    known, trusted = (scene_points(capture, _MAX_SCENE_POINTS, seen, about) for seen in (MIN_SEEN_BY, _TRUSTED_SEEN_BY))
+    return trusted if 2 * len(trusted) >= len(known) else known
 
 
 class _Support:

@@ -12,20 +12,26 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from vdgs.captures.camera_height import camera_height
+from vdgs.captures.camera_height import camera_height, height_range, view_distance
 from vdgs.captures.capture import Capture, spread_evenly
 from vdgs.captures.capture_dates import date_taken, first_and_last
-from vdgs.captures.place_record import Bounds, PlaceFacts
+from vdgs.captures.place_record import ON_CONVERGENCE, ON_GROUND, ON_SHOWN, Bounds, PlaceFacts
 from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.captures.scene_points import MIN_SEEN_BY, ground_sampling_distance, scene_points
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu, wrap_degrees
 from vdgs.geometry.map_projection import MapProjection
+from vdgs.geometry.similarity import sample_points
+from vdgs.geometry.view_convergence import find_convergence
 from vdgs.visibility.visibility_counts import count_visibility
 
 #: Points by which the place is measured, at most; cells of the longer side of the grid by which its area is; and the
 #: share of points left out on every side, as in maps.
 _MAX_POINTS, _CELLS, _TRIM_QUANTILE = 100_000, 128, 0.002
+#: The ground below a camera is the median height of so many points, the nearest across.
+_POINTS_BELOW = 15
+#: Views that look less down than this (degrees from straight down; median) show walls or what is far behind (choice).
+_LEVEL_TILT_DEG = 60.0
 #: Photographs that are asked for their date.
 _MAX_DATED = 60
 #: The name of the capture in a run of photographs alone, for which the name of the run is shown.
@@ -61,15 +67,41 @@ def measure_place(capture: Capture) -> PlaceFacts:
     if not flown:
         flown = first_and_last(date_taken(view.image_path) for view in spread_evenly(capture.views, _MAX_DATED))
     used, root = len(capture.views), capture.root.resolve()
+    pixel, pixel_shows = _pixel(capture)
     return PlaceFacts(
         name=root.parent.name if reconstruction and root.name == OWN_CAPTURE else root.name,
         unit=ground.unit, photographs_used=used, photographs_test=len(capture.test_views),
         photographs_found=max(used, reconstruction.found if reconstruction else used + capture.num_unused_images),
-        flown=flown, ground_sampling_distance=ground_sampling_distance(capture), image_folder=capture.images,
-        downscale=capture.downscale, height=camera_height(capture), extent=extent, area=area, crs_extent=crs_extent,
+        flown=flown, ground_sampling_distance=pixel, pixel_shows=pixel_shows, image_folder=capture.images,
+        downscale=capture.downscale, height=camera_height(capture), heights=_heights(capture), extent=extent, area=area,
+        crs_extent=crs_extent,
         crs_name=crs_name, crs_unit=crs_unit, latitudes=latitudes, longitudes=longitudes, accuracy=ground.accuracy,
         accuracy_method=reconstruction.georeferenced if reconstruction else ground.method,
     )  # fmt: skip
+
+
+def _pixel(capture: Capture) -> tuple[float | None, str]:
+    """What a pixel of the training photographs shows, and of what: of the place on which their views converge, or else
+    of the points, of which those far behind a thing that stands up are the most."""
+    cameras = [view.camera for view in capture.train_views]
+    converged = find_convergence(cameras)
+    if converged is not None:
+        looking = [camera for camera, looks in zip(cameras, converged.looking, strict=True) if looks]
+        sizes = [float(np.linalg.norm(camera.position - converged.place)) / camera.fx for camera in looking]
+        return float(np.median(sizes)), ON_CONVERGENCE
+    tilt_deg = np.degrees(np.arccos(np.clip(np.median([-camera.forward[2] for camera in cameras]), -1, 1)))
+    return ground_sampling_distance(capture), ON_GROUND if tilt_deg <= _LEVEL_TILT_DEG else ON_SHOWN
+
+
+def _heights(capture: Capture) -> Bounds | None:
+    """The lowest and the highest of the training cameras over the points below, where they fly at several heights:
+    those of a flight along a slope are one."""
+    centers, points = np.array([view.camera.position for view in capture.train_views]), capture.points
+    if not len(points) or not view_distance(centers, points, np.array([0.0, 0.0, 1.0])).is_height:
+        return None
+    points = sample_points(points, _MAX_POINTS)
+    below = cKDTree(points[:, :2]).query(centers[:, :2], k=min(_POINTS_BELOW, len(points)), workers=1)[1]
+    return height_range(centers[:, 2] - np.median(points[below.reshape(len(centers), -1), 2], axis=1))
 
 
 def _area(

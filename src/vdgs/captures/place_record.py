@@ -10,6 +10,8 @@ from vdgs.system.units import format_length, three_digits
 #: From this many square metres on areas are in hectares, then in square kilometres.
 _HECTARE, _SQUARE_KILOMETER = 10_000.0, 1_000_000.0
 UNKNOWN_UNIT = "unknown: no position or known distance gives a scale; lengths are in units of the scene"
+#: What pixels are measured on: where photographs look down; where they look at walls; where their views converge.
+ON_GROUND, ON_SHOWN, ON_CONVERGENCE = "on the ground", "on what they show (median)", "on what all of them look at"
 
 Bounds = tuple[float, ...]
 
@@ -27,12 +29,14 @@ class PlaceFacts:
     flown: tuple[str, ...]
     """When the first and the last photograph were taken; empty where they do not say it."""
     ground_sampling_distance: float | None
-    """What a pixel of the photographs shows, at the size at which they are used."""
+    """What a pixel of the photographs shows of what `pixel_shows` says, at the size at which they are used."""
     image_folder: str
     downscale: float = 1.0
     """By what `--downscale` shrinks the photographs of that folder."""
     height: float
-    """How high the cameras fly above the points, or how far they are from them."""
+    """How high the cameras fly above the points, or how far they are from them; their median."""
+    heights: Bounds | None = None
+    """The lowest and the highest over what is below them, where cameras fly at several heights."""
     extent: Bounds | None
     """x0, y0, x1, y1 in the ground frame of what at least two training photographs show; None: too few points."""
     area: float | None
@@ -47,6 +51,7 @@ class PlaceFacts:
     """West and east."""
     accuracy: str
     accuracy_method: str
+    pixel_shows: str = ON_GROUND
 
     @property
     def image_source(self) -> str:
@@ -81,9 +86,11 @@ def place_rows(facts: PlaceFacts, more_on_pixels: Sequence[tuple[str, str]] = ()
         rows.append(("Area", f"{format_area(facts.area, unit)} in at least two training photographs, within {size}"))
     if facts.ground_sampling_distance is not None:
         gsd = format_length(facts.ground_sampling_distance, unit)
-        rows.append(("Pixel of the photographs", f"{gsd} on the ground ({facts.image_source}, as used)"))
+        rows.append(("Pixel of the photographs", f"{gsd} {facts.pixel_shows} ({facts.image_source}, as used)"))
     rows += more_on_pixels
-    rows.append(("Height of the cameras", f"{three_digits(facts.height)} {unit}"))
+    heights = " to ".join(three_digits(each) for each in facts.heights or ())
+    apart = f" (median; {heights} {unit} over what is below)" if heights else ""
+    rows.append(("Height of the cameras", f"{three_digits(facts.height)} {unit}{apart}"))
     if unit == "m":
         rows.append(("Accuracy", facts.accuracy or "not stated by the capture"))
         rows += [("Placed by", facts.accuracy_method)] if facts.accuracy_method else []

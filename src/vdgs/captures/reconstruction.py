@@ -154,6 +154,8 @@ class ReconstructionReport:
     """Of the place; None where there is none."""
     up: str = ""
     """By what z is up in a world without metres; empty where nothing tells, and for worlds with metres."""
+    heights_m: tuple[float, ...] | None = None
+    """The lowest and the highest camera over the median point, where they fly at several heights."""
     flown: tuple[str, ...] = ()
     """When the first and the last photograph were taken, as EXIF has it; empty where it says nothing."""
 
@@ -242,12 +244,18 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
         )
     if metadata.height_m is not None:
         recorded = f", {metadata.recorded_height_m:.1f} m recorded" if metadata.recorded_height_m is not None else ""
-        rows.append(("Flying height", f"{metadata.height_m:.1f} m over the median point{recorded}"))
+        height = flying_height(metadata.height_m, metadata.heights_m)
+        rows.append(("Flying height", f"{height} over the median point{recorded}"))
     if metadata.tilt_deg is not None:
         against = metadata.attitude_difference_deg
         recorded = f"; down is {against:.1f}° from what the drone recorded" if against is not None else ""
         rows.append(("Tilt of the views", f"{metadata.tilt_deg:.1f}° (median){recorded}"))
     return rows
+
+
+def flying_height(height_m: float, heights_m: tuple[float, ...] | None) -> str:
+    """A median height, and the lowest and the highest where these differ much (`camera_height.height_range`)."""
+    return f"{height_m:.1f} m" + (f" (median; {heights_m[0]:.1f} to {heights_m[1]:.1f} m)" if heights_m else "")
 
 
 def by_axis(

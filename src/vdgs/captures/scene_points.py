@@ -19,12 +19,20 @@ _MAX_GSD_CAMERAS = 60
 
 
 def scene_points(
-    capture: Capture, max_points: int | None = None, min_seen_by: int = MIN_SEEN_BY
+    capture: Capture,
+    max_points: int | None = None,
+    min_seen_by: int = MIN_SEEN_BY,
+    about: tuple[Float[np.ndarray, "3"], float] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
-    """The sparse points [n, 3] that at least so many training cameras see, without the background; of `max_points` of
-    them if given."""
+    """The sparse points [n, 3] that at least so many training cameras see, without the background; of those in a sphere
+    `about` a place (which, radius), and of `max_points` of them, if given."""
     cameras = [view.camera for view in capture.train_views]
-    points = capture.points if max_points is None else sample_points(capture.points, max_points)
+    points = capture.points
+    if about is not None:
+        points = points[np.linalg.norm(points - about[0], axis=1) <= about[1]]
+    points = points if max_points is None else sample_points(points, max_points)
+    if not len(points):
+        return points
     seen = count_visibility(torch.from_numpy(points), cameras).numpy()
     shown = points[seen >= min(min_seen_by, len(cameras))]
     if not len(shown):

@@ -99,7 +99,7 @@ class _BakedScene:
 
 
 def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
-    """All of the flight, before the color that the model has behind it; ground frame."""
+    """The first view (`default_view`), before the color that the model has behind it; ground frame."""
     position, target = default_view(run.capture)
     red, green, blue = (float(each) for each in run.model.background)
     title = run.capture.root.resolve().name or "scene"

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from vdgs.config.commands import MAX_FRAMES
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.view_convergence import Convergence, find_convergence
 
 DEFAULT_FPS = 30.0
 DEFAULT_SECONDS = 12.0
@@ -26,6 +27,8 @@ class CameraPath:
 
     cameras: tuple[Camera, ...]
     fps: float
+    converged: Convergence | None = None
+    """The place at which all of them look, where the views of the training cameras converge on it."""
 
 
 def frame_count(seconds: float, fps: float) -> int:
@@ -77,23 +80,30 @@ def orbit(
     seconds: float = DEFAULT_SECONDS,
     fps: float = DEFAULT_FPS,
 ) -> CameraPath:
-    """Once around the middle of the scene, looking at it, as high as the flight.
+    """Once around what the photographs look at, looking at it, as high as the flight.
 
-    The middle is the median of the points. The orbit is an ellipse along the axes of the flight, so that
-    a long narrow one is not left sideways: its half axes are two thirds of the 90 % extent of the
-    training cameras, but at least a quarter of the height (choices). `template` gives intrinsics and size.
+    That is the place on which their views converge (`find_convergence`), seen from as far as those views are; where
+    they do not, the median of the points. The orbit is an ellipse along the axes of the flight, so that
+    a long narrow one is not left sideways: its half axes are the 90 % extent of the training cameras that converge,
+    or two thirds of that of all, but at least a quarter of the height (choices). `template` gives intrinsics and size.
     """
-    center = np.median(points, axis=0)
+    converged = find_convergence(cameras)
     positions = np.stack([camera.position for camera in cameras])
-    height = max(float(np.median(positions[:, 2]) - center[2]), 1e-3)
+    if converged is not None:
+        # No nearer: photographs of what is tall hold it just so, and from within their ring its top is cut off.
+        center, positions, share = converged.place, positions[converged.looking], 1.0
+        height = float(np.median(positions[:, 2]) - center[2])
+    else:
+        center, share = np.median(points, axis=0), 2.0 / 3.0
+        height = max(float(np.median(positions[:, 2]) - center[2]), 1e-3)
     offsets = positions[:, :2] - center[:2]
     axes = np.linalg.svd(offsets, full_matrices=False)[2] if len(offsets) > 1 else np.eye(2)
     reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
-    radii = np.maximum(2.0 / 3.0 * reach, 0.25 * height)
+    radii = np.maximum(share * reach, 0.25 * abs(height))
     angles = np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False)
     offsets = ((radii * [np.cos(angle), np.sin(angle)]) @ axes for angle in angles)
     poses = (look_at_pose(center + np.append(offset, height), center) for offset in offsets)
-    return CameraPath(tuple(replace(template, camera_from_world=pose) for pose in poses), fps)
+    return CameraPath(tuple(replace(template, camera_from_world=pose) for pose in poses), fps, converged)
 
 
 def flyover(
@@ -106,13 +116,25 @@ def flyover(
     """Along the track of the training cameras, smoothed, looking ahead and down.
 
     `tilt_deg` is the angle from straight down; by default the median of the training cameras, at least
-    20. Cameras are taken in the order given, or from neighbor to neighbor where that is much shorter
-    (names do not always follow the flight). The speed is even.
+    20. Where it is not given and views converge on a place (`find_convergence`), the film looks at that place, along
+    the track of the cameras that do: what is ahead in an orbit is not what it was flown for. Cameras are taken in the
+    order given, or from neighbor to neighbor where that is much shorter (names do not always follow the flight). The
+    speed is even.
     """
     if not cameras:
         raise ValueError("a flyover needs training cameras")
     from scipy.ndimage import gaussian_filter1d
 
+    converged = find_convergence(cameras) if tilt_deg is None else None
+    if converged is not None:
+        place, looking = converged.place, np.stack([camera.position for camera in cameras])[converged.looking]
+        away = np.linalg.norm(looking - place, axis=1)
+        # Distances are smoothed by themselves: a smoothed ring is narrower, and what is tall would not fit the frames.
+        track, away = np.split(_smooth_track(np.column_stack([looking, away]), frame_count(seconds, fps)), [3], axis=1)
+        offsets = track - place
+        offsets *= away / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
+        poses = (look_at_pose(place + offset, place) for offset in offsets)
+        return CameraPath(tuple(replace(template, camera_from_world=pose) for pose in poses), fps, converged)
     if tilt_deg is None:
         downwards = np.clip([-camera.forward[2] for camera in cameras], -1.0, 1.0)
         tilt_deg = max(FLYOVER_TILT_DEG, float(np.degrees(np.arccos(np.median(downwards)))))
@@ -180,8 +202,8 @@ def _tangents(
     return (padded[2:] - padded[:-2]) / (times[2:] - times[:-2])[:, None]
 
 
-def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[np.ndarray, "f 3"]:
-    """The positions as one even, smooth line of `n_frames` points."""
+def _smooth_track(positions: Float[np.ndarray, "n k"], n_frames: int) -> Float[np.ndarray, "f k"]:
+    """The positions, and what is to be smoothed with them, as one even, smooth line of `n_frames` points."""
     if len(positions) > _MAX_TRACK_CAMERAS:
         positions = positions[np.linspace(0, len(positions) - 1, _MAX_TRACK_CAMERAS).round().astype(int)]
     chained = _neighbor_order(positions)
@@ -197,7 +219,7 @@ def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[n
     return _resample_line(smooth, n_frames)
 
 
-def _neighbor_order(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _neighbor_order(positions: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """From the first position always to the nearest one not yet visited; O(n²)."""
     left, order = np.ones(len(positions), bool), [0]
     left[0] = False
@@ -208,12 +230,12 @@ def _neighbor_order(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n
     return positions[order]
 
 
-def _resample_line(line: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
+def _resample_line(line: Float[np.ndarray, "n k"], count: int) -> Float[np.ndarray, "m k"]:
     """`count` points at even distances along a polyline."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], count)
     return np.stack([np.interp(at, along, column) for column in line.T], axis=1)
 
 
-def _length(line: Float[np.ndarray, "n 3"]) -> float:
+def _length(line: Float[np.ndarray, "n k"]) -> float:
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())

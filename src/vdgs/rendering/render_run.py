@@ -36,7 +36,7 @@ from vdgs.system.atomic_files import write_array
 from vdgs.system.console import print_warning, track
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.stop_signals import check_stop_requested
-from vdgs.system.units import data_size
+from vdgs.system.units import data_size, three_digits
 from vdgs.visibility.visibility_counts import FADE_BELOW, NearbyCameras, count_visibility
 
 #: Frames a second of a video of separate views.
@@ -124,7 +124,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
         )
     if request.seconds and request.path is None and request.views in ("test", "train"):
         console.print(f"[yellow]note[/] --seconds is of camera paths; --views {request.views} draws one frame a view")
-    named, fps = _named_cameras(request, run_cameras)
+    named, fps = _named_cameras(request, run_cameras, console)
     if request.width:
         named = [(name, camera.resized(request.width, _height(camera, request.width))) for name, camera in named]
     _check_size(request, [camera for _, camera in named])
@@ -255,7 +255,9 @@ def _load_cameras(request: RenderRequest, run: OpenedModel) -> RunCameras:
     return run_cameras_of_capture(capture)
 
 
-def _named_cameras(request: RenderRequest, run_cameras: RunCameras) -> tuple[list[tuple[str, Camera]], float]:
+def _named_cameras(
+    request: RenderRequest, run_cameras: RunCameras, console: Console
+) -> tuple[list[tuple[str, Camera]], float]:
     """The cameras with their names, and the frames per second for a video of them."""
     if request.path is None and request.views in ("test", "train"):
         views = run_cameras.test if request.views == "test" else run_cameras.train
@@ -272,6 +274,13 @@ def _named_cameras(request: RenderRequest, run_cameras: RunCameras) -> tuple[lis
         path = camera_paths.orbit(run_cameras.scene_center[None], cameras, cameras[0], seconds, fps)
     else:
         path = camera_paths.flyover(cameras, cameras[0], seconds, fps)
+    if path.converged is not None:
+        place, away = ", ".join(f"{value:.1f}" for value in path.converged.place), path.converged.distance
+        console.print(
+            f"[yellow]note[/] the views of the photographs converge on a place, which the frames look at: {place} of "
+            f"the ground frame, {three_digits(away)} {ground.unit} from the cameras (median)",
+            highlight=False,
+        )
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
 
 

@@ -234,6 +234,7 @@ def ortho_section(report: ReportedRun) -> Html:
                 + f"{levels_of(metadata)}: GeoTIFFs in maps/. Blank is what is not solid, or what no training "
                 "photograph shows."
             ),
+            *(paragraph(note, "note") for note in metadata.texts("notes")),
             figure(source.image("maps/preview.png"), "The scene as maps.", "maps of the scene", True),
         ]
     return section("maps", "Maps", parts, source.notes)

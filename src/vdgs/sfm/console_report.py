@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, report_rows
+from vdgs.captures.reconstruction import ReconstructionReport, excluded_lines, flying_height, report_rows
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.preflight import PreflightReport
 
@@ -29,7 +29,8 @@ def print_preflight(preflight: PreflightReport, collection: ImageList, plan: lis
         )
     rows.append(("Positions", _positions_text(preflight)))
     if preflight.height_m is not None:
-        rows.append(("Flying height", f"{preflight.height_m:.1f} m {preflight.height_from}"))
+        height = flying_height(preflight.height_m, preflight.heights_m)
+        rows.append(("Flying height", f"{height} {preflight.height_from}"))
     if preflight.gsd_m is not None:
         rows.append(("A pixel shows", f"about {100 * preflight.gsd_m:.1f} cm of the ground"))
     elif not preflight.shows_ground:

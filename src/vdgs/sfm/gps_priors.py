@@ -33,6 +33,9 @@ ALTITUDE_UNKNOWN = "not recorded; 0 is that of the median point"
 #: What altitudes may be rounded to (metres; feet among them), and from how many positions on that is told; their error
 #: then, as a share of the step (choice: nobody says whether they were rounded or cut off).
 STEPS_M, LEAST_ROUNDED, ROUNDING_ERROR = (100.0, 50.0, 30.48, 20.0, 10.0, 5.0, 3.048, 2.0, 1.0), 8, 1 / 3
+#: Fewer different altitudes are rather the levels of a plan (rings, strips of a wall), unless at least so many
+#: photographs differ from those before and after, which have one altitude: a drone that sways about a step (choices).
+LEAST_DIFFERENT, LEAST_SWAYING = 5, 2
 #: Altitudes that are this near to a step (metres) are on it.
 ON_STEP_M = 0.02
 #: Fewer positions fix no scale and no directions.
@@ -177,8 +180,14 @@ def _of_places_apart(enu: np.ndarray) -> list[str]:
 
 
 def _altitude_step(altitudes: np.ndarray) -> float:
-    """The largest of usual steps that all altitudes [n] are multiples of; 0 where there is none, or all are one."""
+    """The largest of usual steps that all altitudes [n], in the order of photographs, are multiples of; 0 where there
+    is none, or they are few levels."""
     if len(altitudes) < LEAST_ROUNDED or np.ptp(altitudes) < ON_STEP_M:
+        return 0.0
+    different = 1 + np.count_nonzero(np.diff(np.sort(altitudes)) > ON_STEP_M)
+    before, at, after = altitudes[:-2], altitudes[1:-1], altitudes[2:]
+    swaying = np.count_nonzero((np.abs(after - before) < ON_STEP_M) & (np.abs(at - before) > ON_STEP_M))
+    if different < LEAST_DIFFERENT and swaying < LEAST_SWAYING:
         return 0.0
     return next((s for s in STEPS_M if np.abs(altitudes - s * np.round(altitudes / s)).max() < ON_STEP_M), 0.0)
 

@@ -224,7 +224,13 @@ def fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary, options.ceres.solver_options.num_threads = False, threads
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    call_cancellable(lambda cancellation_token: pycolmap.bundle_adjustment(model, options))
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in placed_images(model):
+        config.add_image(image.image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not `pycolmap.bundle_adjustment`, which sets COLMAP's log back to telling all.
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
+    call_cancellable(lambda cancellation_token: adjuster.solve())
     model.update_point_3d_errors()
 
 

@@ -13,6 +13,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from shapely import MultiPoint
 
+from vdgs.captures.camera_height import height_range
 from vdgs.sfm.flights import LEAST_PHOTOGRAPHS, flights_of, time_of, time_order
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
@@ -57,6 +58,8 @@ class PreflightReport:
     rtk: bool
     """Whether all these are as accurate as with corrections."""
     height_m: float | None
+    heights_m: tuple[float, float] | None
+    """The lowest and the highest, where they differ much."""
     height_from: str
     tilt_deg: float | None
     """Median of the recorded angles between views and straight down; None where no photograph says."""
@@ -81,7 +84,8 @@ class PreflightReport:
 def make_preflight_report(collection: ImageList, positions: GpsPriors) -> PreflightReport:
     """All that can be said without decoding pixels."""
     photographs = collection.images
-    height, height_from = flying_height(photographs)
+    heights, height_from = flying_heights(photographs)
+    height = statistics.median(heights) if heights else None
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
     tilt, pixel = _median(tilts), _pixel_rad(photographs)
     away = _distance_of_ground(height, tilt)
@@ -102,7 +106,7 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
         altitude_reference=positions.altitude_reference,
         accurate=len(accuracies),
         rtk=bool(accuracies) and max(accuracies) < RTK_M,
-        height_m=height, height_from=height_from, tilt_deg=tilt, pixel_rad=pixel,
+        height_m=height, heights_m=height_range(heights), height_from=height_from, tilt_deg=tilt, pixel_rad=pixel,
         gsd_m=away * pixel if away and pixel else None,
         forward_overlap=overlap, views_per_point=views,
         oblique=sum(tilt > OBLIQUE_ANGLE_DEG for tilt in tilts) if tilts else None,
@@ -111,14 +115,14 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     )  # fmt: skip
 
 
-def flying_height(photographs: Sequence[ImageMetadata]) -> tuple[float | None, str]:
-    """Median height above the take-off in metres, and what says so."""
+def flying_heights(photographs: Sequence[ImageMetadata]) -> tuple[list[float], str]:
+    """Heights above the take-off in metres, none where too few photographs say theirs; and what says so."""
     heights = [
         photo.relative_altitude for photo in photographs if photo.relative_altitude and photo.relative_altitude > 1
     ]
     if 2 * len(heights) < len(photographs):
-        return None, "the photographs do not say it"
-    return statistics.median(heights), "above the take-off, by XMP"
+        return [], "the photographs do not say it"
+    return heights, "above the take-off, by XMP"
 
 
 def _spread(positions: GpsPriors) -> tuple[float, float] | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vdgs.captures.camera_height import height_range
 from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
@@ -72,7 +73,8 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     collection, positions, look = plan.image_list, plan.gps_priors, plan.preflight
     images = placed_images(model)
     metric = placed is not None
-    height = _height(model, images) if metric else None
+    heights = _heights(model, images) if metric else None
+    height = None if heights is None else float(np.median(heights))
     tilt = tilt_of_views(np.array([image.cam_from_world().rotation.matrix() for image in images])) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, result.found.photographs) if metric else None
@@ -99,7 +101,8 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         altitude_reference=_altitudes(plan, placed) if placed and placed.is_georeferenced else "",
         origin=result.found.origin,
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
-        focal_fixed=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
+        focal_fixed=held[0], focal_reason=held[1], height_m=height,
+        heights_m=None if heights is None else height_range(heights), recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
         photographs=_photographs(collection, positions, placed, result.excluded), warnings=(*warnings, *of_place),
         advice=tuple(advice),
@@ -175,9 +178,10 @@ def _rms(placed: Georegistration | None) -> tuple[float, ...] | None:
     return tuple(float(value) for value in np.sqrt((placed.residuals[placed.inliers] ** 2).mean(axis=0)))
 
 
-def _height(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> float:
-    heights = [image.projection_center()[2] for image in images]
-    return float(np.median(heights) - np.median(model_points(model)[:, 2]))
+def _heights(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> np.ndarray:
+    """Of the cameras over the median point, [n]."""
+    heights = np.array([image.projection_center()[2] for image in images])
+    return heights - np.median(model_points(model)[:, 2])
 
 
 def cameras_of(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tuple[CameraReport, ...]:

@@ -172,6 +172,8 @@ class MapMetadata(TypedDict, total=False):
     notes: list[str]
     mapped_share: float
     seen_by_fewer_than_5_share: float | None
+    #: Of the ground that no training camera sees from nearer to straight above than 60°.
+    seen_at_grazing_angles_share: float
     lowest: float | None
     highest: float | None
 

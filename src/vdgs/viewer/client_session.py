@@ -258,7 +258,7 @@ class ClientSession:
         @buttons.on_click
         def _(_: Any) -> None:
             poses: dict[str, Callable[[], CameraPose]] = {
-                "All": lambda: navigation.overview_pose(self.scene.capture, self.client.camera.aspect),
+                "All": lambda: navigation.overview_pose(self.scene.capture, self.client.camera.aspect, whole=True),
                 "From above": lambda: navigation.top_down_pose(self.pose),
                 "North up": lambda: navigation.north_up_pose(self.pose),
             }

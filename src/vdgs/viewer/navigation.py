@@ -71,9 +71,10 @@ def _rotation_matrix(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + 2.0 * (w * cross + cross @ cross)
 
 
-def overview_pose(capture: Capture, aspect: float = 1.0) -> CameraPose:
-    """All of the flight, on a canvas of this width over its height."""
-    position, target = default_view(capture)
+def overview_pose(capture: Capture, aspect: float = 1.0, whole: bool = False) -> CameraPose:
+    """The first view, on a canvas of this width over its height: all of the flight, or unless the `whole` is asked for,
+    what the photographs look at (`default_view`)."""
+    position, target = default_view(capture, whole)
     return CameraPose(target + max(1.0, 1.0 / aspect) * (position - target), target)
 
 

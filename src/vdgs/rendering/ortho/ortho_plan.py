@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.grazing_views import grazing_note, grazing_share
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.captures.strays import folder_in_run
 from vdgs.config.commands import OrthoRequest
@@ -63,6 +64,8 @@ class OrthoPlan:
 
     warning: str = ""
     """Why it is not the model that one would expect (`runs.open_run`); empty where it is."""
+    grazing_share: float = 0.0
+    """What of the ground is seen at grazing angles alone (`captures.grazing_views`)."""
 
     @staticmethod
     def of(
@@ -86,12 +89,17 @@ class OrthoPlan:
         return OrthoPlan(
             folder=folder, run_name=run.name, model=model, model_digest=model_digest, nadir_camera=above, grid=grid,
             samples=samples_per_side(grid.gsd, finest), detail_from_images=request.detail_from_images,
-            lod_error=request.lod_error, warning=warning,
+            lod_error=request.lod_error, warning=warning, grazing_share=grazing_share(capture),
         )  # fmt: skip
 
     @property
     def placement(self) -> MapProjection:
         return self.nadir_camera.placement
+
+    @property
+    def notes(self) -> list[str]:
+        """What people should know of its place and of its photographs."""
+        return [*self.placement.notes, *filter(None, [grazing_note(self.grazing_share)])]
 
     @contextmanager
     def tile_renderer(self, model: Drawable) -> Iterator[TileRenderer]:

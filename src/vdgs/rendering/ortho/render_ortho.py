@@ -152,7 +152,7 @@ def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> Non
     """Print how large the map will be; raise VdgsError where the disk has no room for it."""
     grid, placement, folder = plan.grid, plan.placement, plan.folder
     print_warning(console, plan.warning)
-    for note in placement.notes:
+    for note in plan.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
     share = _DISK_SHARE + sharded  # tiles of shards lie beside it until all are gathered
     bytes_per_pixel = sum(layer.bytes_per_pixel for layer in raster_layers(placement))
@@ -222,5 +222,6 @@ def _metadata(plan: OrthoPlan) -> MapMetadata:
         "samples_per_pixel": plan.samples**2, "sharpened": plan.detail_from_images,
         "training_cameras": len(capture.train_views),
         # Of the warning what is wrong, without the command, which has the path of the run.
-        "notes": [*filter(None, [plan.warning.partition(":")[0]]), *placement.notes], "lod_error": plan.lod_error,
+        "notes": [*filter(None, [plan.warning.partition(":")[0]]), *plan.notes],
+        "lod_error": plan.lod_error, "seen_at_grazing_angles_share": plan.grazing_share,
     }  # fmt: skip
