@@ -279,3 +279,42 @@ def test_a_long_line_is_not_doubted_for_what_up_may_be_off_by():
     fit, notes = _checked_on_a_line(fit_positions(problem), problem)
     assert not notes
     assert fit.place_error_m[1] < 15
+
+
+def strip(seed: int, sag_m: float = 2.5, noise_m: float = 0.5) -> tuple[np.ndarray, Problem]:
+    """One strip of 300 m at one height, which a wrong focal length bent, below views that may be of a wall; and where it
+    was flown."""
+    rng, x = np.random.default_rng(seed), np.linspace(-150, 150, 24)
+    places = np.stack([x, 0.3 * np.sin(x), 46 + 0.3 * np.cos(3 * x)], axis=1)
+    bent = places + np.outer(sag_m * ((x / 150) ** 2 - 0.33), [0, 0, 1])
+    recorded = places + rng.normal(0, noise_m, places.shape)
+    up = Up(views(rng.normal(0, 2)).direction, 20.0, "the views", sure=False)
+    return places, Problem(centers=bent, targets=recorded, times=np.linspace(0, 1, 24), up=up)
+
+
+def test_altitudes_along_one_strip_are_no_drift_of_dozens_of_metres():
+    """Along one line a drift and a tilt look the same, and a tilt and the scale: neither follows what errors are by
+    chance."""
+    within = []
+    for seed in range(20):
+        _, problem = strip(seed)
+        fit = fit_positions(problem)
+        assert fit.altitude == "used"
+        assert abs(np.degrees(np.arcsin(fit.similarity.rotation[2, 0]))) < 1.0
+        assert abs(fit.similarity.scale - 1) < 0.015
+        within += [tilt_deg(fit) <= fit.level_error_deg, abs(fit.similarity.scale - 1) <= fit.scale_error]
+    assert np.mean(within) >= 0.9
+
+
+def test_level_of_a_grid_holds_a_drift_that_does_not_show():
+    """Strips beside each other, one after the other: a drift of the altitudes tilts them."""
+    along, across = np.meshgrid(np.linspace(-75, 75, 8), 25 * (np.arange(6) - 2.5))
+    along[1::2] *= -1
+    places = np.stack([along.ravel(), across.ravel(), np.full(48, 60.0)], axis=1)
+    within = []
+    for seed in range(12):
+        recorded = places + np.random.default_rng(seed).normal(0, 3, places.shape) * [0.8, 0.8, 1.2]
+        recorded[:, 2] += np.linspace(0, 12.0, 48)
+        fit = fit_of(places, recorded, views(1.0, 20.0))
+        within.append(tilt_deg(fit) <= fit.level_error_deg)
+    assert np.mean(within) >= 0.9

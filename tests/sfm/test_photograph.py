@@ -515,7 +515,9 @@ def strips(count: int, each: int) -> np.ndarray:
             np.vstack([circle(30.0), strips(2, 8) + np.array([3e4, 0, 0])]), 0.5, False, id="a house and another site"
         ),
         pytest.param(strips(5, 8) * [400, 400, 40], 1.0, True, id="from high up, kilometres from one to the next"),
-        pytest.param(strips(1, 20), 0.5, False, id="a line"),
+        pytest.param(strips(1, 20), 0.5, True, id="a line"),
+        pytest.param(strips(1, 20) * [1, 1, 0] + np.outer(np.arange(20), [0, 0, 3]), 0.5, True, id="a climbing line"),
+        pytest.param(strips(1, 20) / 10, 0.5, False, id="a row of steps"),
         pytest.param(circle(30.0), 0.5, False, id="around a house"),
         pytest.param(circle(30.0) * [1, 0.3, 1], 0.5, False, id="around a long house"),
         pytest.param(circle(1.5), 2.0, False, id="around a statue"),

@@ -152,3 +152,15 @@ def test_mirrored_positions_of_a_wall_are_refused_all_the_same():
                                                (0.0, 0.0), wrong_m=0.1, recorded=True)  # fmt: skip
     with pytest.raises(CaptureError, match="fit the photographs only once"):
         georegister(model, photographs, replace(positions, enu=positions.enu * [-1, 1, 1]))
+
+
+def test_views_that_positions_tell_from_a_wall_say_up_as_well_as_views_that_look_down():
+    """Along one strip errors of positions tell little of the roll about it: the views do, once they are of no wall."""
+    line = np.stack([np.linspace(-150, 150, 24), 0.3 * np.sin(np.arange(24)), np.full(24, 46.0)], axis=1)
+    ground = np.random.default_rng(2).uniform([-170, -25, -2], [170, 25, 2], (400, 3))
+    for seed in range(6):
+        placed = georegister(*taken_from(line, ground, (90.0, -90.0), wrong_m=0.5, seed=seed))
+        assert isinstance(placed, Georegistration)
+        assert placed.accuracy is not None
+        assert up_off_deg(placed) < min(6.0, placed.accuracy.level_deg)
+        assert placed.accuracy.level_deg < 20

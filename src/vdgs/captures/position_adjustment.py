@@ -24,6 +24,11 @@ LEFT_OUT_SIGMAS = 4.0
 USUAL_M = (1.0, 2.0)
 #: Altitudes that drift, or that say nothing, must explain the flight better by so much (log likelihood; choice).
 DRIFT_COSTS, UNUSED_COSTS = 4.0, 8.0
+#: Altitudes of a receiver drift through a flight by so many metres, hardly ever by many times more (Cauchy; choice).
+DRIFT_M = 10.0
+#: They may drift unseen by as much (one standard deviation), or by so many times what positions differ by across where
+#: that is less: of a better receiver.
+UNSEEN_DRIFT_ACROSS = 20.0
 #: Where the receiver states its accuracy, so many times more; it is believed up to so many times what it states.
 STATED_TIMES, BELIEVED = 5.0, 3.0
 #: Altitudes of a receiver that states no accuracy may step once in a flight, as with another battery, by so many metres
@@ -179,6 +184,9 @@ def settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     similarity = Similarity(state.scale, state.rotation, translation)
     placed = similarity.apply(problem.centers)
     order = problem.in_order(inliers)
+    if model == "used" and problem.stated is None:
+        unseen_m = min(DRIFT_M, UNSEEN_DRIFT_ACROSS * float(gps_std[:2].mean()))
+        normal = _with_unseen_drift(normal, gains, times[inliers], unseen_m)
     wandering = _wandering((residuals / weights)[inliers], order, gains * weights[inliers])
     scale, north, level, place = _errors(normal, wandering, used, gps_std, state.drift, model, _said(problem, inliers))
     level = _with_unseen_step(level, problem, state, gains[:, order], gps_std)
@@ -293,9 +301,9 @@ def _step(
             rows.append(known / problem.scale[1])
             values.append(np.array([math.log(state.scale / problem.scale[0]) / problem.scale[1]]))
         drift = np.zeros((1, 8))
-        drift[0, 7] = 1e-3  # a drift is anything up to a kilometre
+        drift[0, 7] = math.sqrt(2 / (DRIFT_M**2 + state.drift**2))  # the weight of `_drift_cost`
         rows.append(drift)
-        values.append(np.array([1e-3 * state.drift]))
+        values.append(drift[0, 7:] * state.drift)
         stacked = np.concatenate(rows)
         normal = stacked.T @ stacked
         change = -np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0]
@@ -364,8 +372,8 @@ def _errors(
     across = radius_95(np.maximum(np.diag(covariance)[4:6], 0.0) + wandering[4:6] + common[:2] ** 2, free[0])
     times = radius_95(np.ones(1), free[1])
     mean_up = times / math.sqrt((1 / deviations[:, 2] ** 2).sum()) if model == "unused" else float(errors[6])
-    # What is level decides how much of the altitudes is drift: at most half of it again may be tilt.
-    drift_error = min(float(errors[7]), abs(drift) / 2) if model == "drifts" else 0.0
+    # What is level decides how much of the altitudes is drift.
+    drift_error = float(errors[7]) if model == "drifts" else 0.0
     up = math.hypot(mean_up, times * float(common[2]) + (abs(drift) + drift_error) / 2)
     level = float(np.degrees(np.hypot(*errors[1:3])))
     return float(math.expm1(min(50.0, errors[0]))), float(np.degrees(errors[3])), level, (across, up)
@@ -377,6 +385,17 @@ def radius_95(variances: np.ndarray, free: float) -> float:
     axes = float(variances.sum() ** 2 / (variances**2).sum())
     times = fdtri(axes, free, 0.95) if math.isfinite(free) else chdtri(axes, 0.05) / axes
     return math.sqrt(float(variances.sum()) * float(times))
+
+
+def _with_unseen_drift(normal: np.ndarray, gains: np.ndarray, times: np.ndarray, unseen_m: float) -> np.ndarray:
+    """The normal matrix [8, 8] of altitudes that count as they are, with a drift of `unseen_m` (one standard deviation)
+    as far as they would not show it: along one line a drift and a tilt look the same. `gains` [8, m, 3], `times` [m].
+    """
+    counted = np.einsum("ij,jm->im", normal, gains[:, :, 2])  # what each altitude adds for each unknown
+    found = normal.copy()
+    found[7, :7] = found[:7, 7] = counted[:7] @ times
+    found[7, 7] = counted[6] @ times**2 + 1 / unseen_m**2
+    return found
 
 
 def _with_unseen_step(
@@ -394,6 +413,11 @@ def _with_unseen_step(
     return max(level_deg, min(math.hypot(level_deg, float(np.degrees(step))), most))
 
 
+def _drift_cost(drift_m: float) -> float:
+    """Of a drift, as negative log likelihood: heavy tails, for some receivers drift by a hundred metres."""
+    return math.log1p((drift_m / DRIFT_M) ** 2)
+
+
 def _score(problem: Problem, state: _State, inliers: np.ndarray, deviations: np.ndarray, model: str) -> float:
     """Negative log likelihood; positions that are left out cost what their limit would."""
     left_out = int((~inliers).sum())
@@ -403,6 +427,7 @@ def _score(problem: Problem, state: _State, inliers: np.ndarray, deviations: np.
         known = 0.5 * (math.log(state.scale / problem.scale[0]) / problem.scale[1]) ** 2
     costs = {"used": 0.0, "drifts": DRIFT_COSTS, "unused": UNUSED_COSTS}[model]
     costs *= 1 if problem.stated is None else STATED_TIMES
+    costs += _drift_cost(state.drift)
     return float(
         np.log(deviations).sum()
         + 0.5 * LEFT_OUT_SIGMAS**2 * left_out

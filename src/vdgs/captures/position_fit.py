@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vdgs.captures.gps_altitudes import are_over_ground
 from vdgs.captures.likely_tilts import Likely, Moments, likely_tilts
-from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, fit_plane, in_plane
+from vdgs.captures.plane_fit import ACROSS_TIMES, ENOUGH_TO_DOUBT, fit_plane, in_plane
 from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, alike_factors, settle
 from vdgs.captures.position_weights import ALIKE_TIMES
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
@@ -26,8 +26,11 @@ HELD_DEG, BOTH_WITHIN = 1e-3, 2.45
 #: Positions of a flight at about one height tell up where it would be off by so many times more without them: heights
 #: differ by less than this share of how far cameras spread (choice).
 TELL_BETTER, ONE_HEIGHT = 1.5, 0.15
-#: Altitudes drift by no more in a flight, in metres (choice): a fit with more is one of positions that do not spread.
-MOST_DRIFT_M = 300.0
+#: Positions lie along one line where they spread across it by less than this share of how far along it (choice), or as
+#: errors do.
+ONE_LINE = 0.05
+#: No altitudes drift by more in a flight, in metres (choice): a fit with more is one of positions that do not spread.
+DRIFT_LIMIT_M = 300.0
 #: The other way that photographs may have been taken must explain positions better by so much (log likelihood; choice).
 OTHER_COSTS = 4.0
 #: And its up must be that of the fit by this cosine (choice).
@@ -38,7 +41,7 @@ OTHER_VIEW = "the views and the positions"
 
 def with_likelier_up(problem: Problem) -> tuple[Problem, str]:
     """The problem with that of two ups which the positions fit better; and, where neither is better by more than
-    `OTHER_COSTS`, what is in doubt."""
+    `OTHER_COSTS`, what is in doubt. Up by views is known better once they rule the other out."""
     other = problem.up.other
     if other is None:
         return problem, ""
@@ -49,7 +52,10 @@ def with_likelier_up(problem: Problem) -> tuple[Problem, str]:
     if abs(fit.score - usual.score) <= OTHER_COSTS:
         return problem, f"{other.doubt}, for the positions do not tell"
     is_upright = fit.similarity.rotation[2] @ other.direction > OTHER_COSINE  # else neither is up: are they mirrored?
-    return (turned if fit.score < usual.score and is_upright else problem), ""
+    if fit.score < usual.score:
+        return (turned if is_upright else problem), ""
+    known_deg = other.ruled_out_deg or problem.up.deviation_deg
+    return replace(problem, up=replace(problem.up, deviation_deg=min(problem.up.deviation_deg, known_deg))), ""
 
 
 def fit_positions(problem: Problem) -> PositionFit:
@@ -66,7 +72,7 @@ def fit_positions(problem: Problem) -> PositionFit:
     if problem.has_altitudes and len(problem.centers) >= ENOUGH_TO_DOUBT:
         models.append("drifts")
     found = [settle(problem, start, model) for start in starts for model in models]
-    found = [fit for fit in found if abs(fit.drift_m) <= MOST_DRIFT_M]
+    found = [fit for fit in found if abs(fit.drift_m) <= DRIFT_LIMIT_M]
     plane = _settle_in_plane(problem)
     best = min([plane, *found], key=lambda fit: fit.score)
     if best.altitude == "used" and _says_less_than_views(best, problem):
@@ -86,11 +92,15 @@ def _level_as_known(drifting: PositionFit, plane: PositionFit) -> PositionFit:
 
 
 def _says_less_than_views(fit: PositionFit, problem: Problem) -> bool:
-    """Whether altitudes tell up less well than it is known without positions."""
+    """Whether altitudes tell up less well than it is known without positions. Across one line no altitudes tell it: there those
+    that do not drift say what they can along it."""
     weights = fit.gps_std[2] / fit.deviations[fit.inliers, 2:]
     places = fit.placed[fit.inliers, :2]
     middle = (places * weights**2).sum(axis=0) / (weights**2).sum()
-    spread = np.linalg.svd((places - middle) * weights, compute_uv=False)[1]
+    along, across = np.linalg.svd((places - middle) * weights, compute_uv=False)
+    noise = float(fit.gps_std[:2].mean()) * math.sqrt(len(places))
+    is_line = across <= max(ONE_LINE * along, ACROSS_TIMES * noise)
+    spread = along if is_line and fit.altitude == "used" else across
     alike = alike_factors(fit.influences, problem.in_order(fit.inliers))[2]
     tilt = np.degrees(np.arctan2(fit.gps_std[2] * alike, max(float(spread), 1e-9)))
     return bool(tilt > problem.up.deviation_deg and fit.gps_std[2] > 2 * fit.gps_std[:2].max())

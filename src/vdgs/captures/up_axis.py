@@ -70,6 +70,8 @@ class OtherUp(NamedTuple):
     """Unit [3], in the world of the cameras."""
     doubt: str
     """What may be taken for what, in words: a sentence without its end."""
+    ruled_out_deg: float | None = None
+    """The standard deviation of the up that was taken, once this one is ruled out; None where that changes nothing."""
 
 
 class UpByViews(NamedTuple):
@@ -251,7 +253,9 @@ def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) 
         return UpByViews(mean, max(VIEWS_DEG, doubt), not is_ceiling and bool(up @ mean > 0), other)
     one_way = np.linalg.norm(rotations[:, 1].mean(axis=0)) > MIN_UP_AGREEMENT  # how the camera hangs does not cancel
     middle = up + (1 if one_way else 2) * mean
-    deviation = UNCERTAIN_DEG if doubts and one_way else VIEWS_DEG * (2 if one_way else 1)  # maybe level at a wall
+    looking_down = VIEWS_DEG * (2 if one_way else 1)
+    deviation = UNCERTAIN_DEG if doubts and one_way else looking_down  # maybe level at a wall
+    other = None if other is None else other._replace(ruled_out_deg=looking_down)
     return UpByViews(middle / np.linalg.norm(middle), deviation, not doubts, other)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from vdgs.captures.gps_altitudes import wrong_reading
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem
+from vdgs.captures.position_adjustment import DRIFT_COSTS, DRIFT_M, STATED_TIMES, PositionFit, Problem
 from vdgs.captures.position_fit import OTHER_COSINE, fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
@@ -32,8 +32,8 @@ MIN_SPREAD_SIGMAS = 3.0
 MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
 #: Altitudes along a line that change so many times their error against what is known of up are worth a note (choice).
 MUCH_DRIFT = 4.0
-#: Altitudes of receivers drift by no more than this in a flight, in metres (choice).
-MOST_DRIFT_M = 20.0
+#: Altitudes of receivers hardly ever drift by more than this in a flight, in metres.
+MOST_DRIFT_M = 2 * DRIFT_M
 ADVICE_WRITE_GPS = (
     "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
     "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
@@ -333,14 +333,14 @@ def _checked_reading(
 def _checked_on_a_line(fit: PositionFit, problem: Problem) -> tuple[PositionFit, list[str]]:
     """The fit of positions along one line, where nothing tells a drift of altitudes from a climb but what is known of
     up without positions: heights are no better than the two differ. A note where that is much."""
-    if fit.altitude != "used" or problem.stated is not None or not problem.up.sure:
+    if fit.altitude != "used" or problem.stated is not None:
         return fit, []
     apart = fit.placed[:, 2] - fit.placed @ fit.similarity.rotation @ problem.up.direction
     drift, (across, up) = float(np.ptp(apart[fit.inliers])), fit.place_error_m
     length = float(np.ptp(fit.placed[fit.inliers, :2], axis=0).max())
     is_explained = drift <= 2 * np.tan(np.radians(problem.up.deviation_deg)) * length  # by up alone
     found = replace(fit, place_error_m=(across, up + (min(drift, MOST_DRIFT_M) if is_explained else drift) / 2))
-    if drift < MUCH_DRIFT * up or (is_explained and drift > MOST_DRIFT_M):
+    if not problem.up.sure or drift < MUCH_DRIFT * up or (is_explained and drift > MOST_DRIFT_M):
         return found, []
     note = (
         f"along the one line of the flight the recorded altitudes change by {two_digits(drift)} m against what "

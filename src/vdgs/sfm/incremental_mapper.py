@@ -38,6 +38,7 @@ STEEPEST = 2.0
 #: Why a focal length is held until the model shows whether it can be fitted: `release_focal`.
 OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
 OF_SLOPE = "one height over a slope, or a climb over level ground; the model will show which"
+OF_LINE = "along one line, which cannot tell it while views are parallel; the model will show whether they are"
 #: Why it is fitted then.
 OF_SHAPE = "several heights or views, as the photographs themselves show, which tell it"
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
@@ -52,6 +53,8 @@ ERRORS_RANGE = 3.29
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
 #: both axes alike); of strips over an area it is (choice).
 ORBIT_RADIUS_SHARE = 0.8
+#: Positions along one line spread across it by no more than this share of how far they spread along it (choice).
+LINE_SHARE = 0.05
 #: So small a share of photographs that are unlike the others changes no rule for all (choice).
 FEW = 0.1
 #: Parts of fewer photographs than this are no model.
@@ -116,6 +119,8 @@ def _by_flight(photographs: Sequence[ImageMetadata], bent: bool) -> tuple[bool, 
 
 def _by_positions(positions: GpsPriors, bent: bool) -> tuple[bool, str] | None:
     """The same by where photographs were taken; unless lenses are `bent`, whatever altitudes of flights differ by."""
+    if not bent and _is_line(positions):
+        return True, OF_LINE
     if _is_survey_grid(positions):
         return True, "level strips over an area: the flight cannot tell it, if it looked straight down"
     if bent or not positions.usable or len(positions.flights) != len(positions):
@@ -148,10 +153,10 @@ def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np
 def release_focal(
     models: list[pycolmap.Reconstruction], held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
 ) -> tuple[bool, str]:
-    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS or OF_SLOPE but the photographs
-    alone show that they were taken from several heights or look several ways, unless it goes astray. Whether it is held
-    then, and why."""
-    if not held[0] or held[1] not in (OF_FLIGHTS, OF_SLOPE):
+    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS, OF_SLOPE or OF_LINE but the
+    photographs alone show that they were taken from several heights or look several ways, unless it goes astray.
+    Whether it is held then, and why."""
+    if not held[0] or held[1] not in (OF_FLIGHTS, OF_SLOPE, OF_LINE):
         return held
     model = models[0]
     images = [image for image in placed_images(model) if image.num_points3D]
@@ -159,10 +164,16 @@ def release_focal(
     views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     ahead = np.median(views, axis=0) / np.linalg.norm(np.median(views, axis=0))
     oblique = np.mean(views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG)))
-    if _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE:
+    is_flat = _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE
+    if is_flat and held[1] != OF_LINE:
         return True, "level strips, as the photographs themselves show, whatever their altitudes say"
     as_held = pycolmap.Reconstruction(model)
+    as_held.update_point_3d_errors()
     fit_focal(model, threads)
+    best = (1 - CLEARLY_NEARER) * mean_reprojection_error(as_held)
+    if is_flat and mean_reprojection_error(model) >= best:  # views that roll and pitch would tell it
+        models[0] = as_held
+        return True, "one line of parallel views, as the photographs themselves show: they cannot tell it"
     if is_astray(model, (False, OF_SHAPE), groups) and is_held_as_good([as_held], models):
         models[0] = as_held
         return True, CONFIRMED
@@ -255,6 +266,16 @@ def _is_survey_grid(positions: GpsPriors, errors: float = 0.0) -> bool:
     heights, moments = enu[:, 2], np.flatnonzero(here)
     steady = heights - np.polyval(np.polyfit(moments, heights, 1), moments)  # altitudes of receivers drift
     return not around and min(_range(heights), _range(steady)) <= np.hypot(errors, MIN_HEIGHT_SPREAD * spread[1])
+
+
+def _is_line(positions: GpsPriors) -> bool:
+    """Whether photographs were taken along one straight line, level or not: of parallel views a longer lens and what
+    is seen farther away look the same, and a focal length that is fitted bends the line."""
+    enu = positions.enu[places_apart(positions.enu) == 0]
+    if len(enu) < MIN_POSITIONS or not positions.usable or not positions.has_altitudes:
+        return False
+    spread = np.linalg.svd(enu - enu.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= LINE_SHARE * spread[0])
 
 
 def _range(heights: np.ndarray) -> float:
