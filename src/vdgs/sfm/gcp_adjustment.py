@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from vdgs.captures.known_distances import MIN_OBSERVATIONS, intersect_rays
+from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.plane_fit import fit_plane, in_plane
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.errors import CaptureError
+from vdgs.geometry.ray_intersection import intersect_rays
 from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear, rotation_to_z
 from vdgs.sfm.bending import bend_to_points
 from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint, are_along_line
