@@ -117,7 +117,9 @@ def test_groups_whose_poses_or_lens_are_left_to_the_program_are_not_taken_for_al
     (tmp_path / "block.xml").write_text(xml)
     project = blocks_exchange.read(tmp_path / "block.xml", OPTIONS)
     assert len(project.views) == len(flight.names)
-    [said] = project.warnings
+    said, counted = project.warnings
+    assert "control point" in counted
+    assert "not used" in counted
     assert f"{len(flight.names) + 1} photographs are not oriented" in said
     assert "bulk.JPG" in said
     [(why, names)] = project.refused.items()

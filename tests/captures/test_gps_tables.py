@@ -90,6 +90,17 @@ def test_tables_are_read_as_programs_write_them(tmp_path, text):
         assert row.gps_std == ((0.5, 1.0) if "0.5 1\n" in text or "RMS" in text else row.gps_std)
 
 
+def test_points_in_wkt_are_positions(tmp_path):
+    """QGIS writes geometries so with GEOMETRY=AS_WKT."""
+    for k, point in enumerate(("POINT (8.5 47.1)", "Point Z(8.5 47.1 3)", "SRID=4326;POINT(8.5 47.1)")):
+        file = tmp_path / f"{k}.csv"
+        rows = [f'"{point.replace("8.5", f"8.50{n}")}",DJI_{n}.JPG,500' for n in range(3)]
+        file.write_text("\n".join(["WKT,photo,altitude", *rows]))
+        rows = read_gps_table(file).rows
+        assert [row.name for row in rows] == ["DJI_0.JPG", "DJI_1.JPG", "DJI_2.JPG"]
+        assert rows[1].position == (47.1, 8.501, 500.0)
+
+
 @pytest.mark.parametrize(("east", "north"), [("0.5", ""), ("", "0.5"), ("-", "0.5")])
 def test_an_accuracy_without_its_other_side_or_in_degrees_is_not_believed(tmp_path, east, north):
     for unit, sides in (("m", (east, north)), ("°", ("0.5", "0.5"))):

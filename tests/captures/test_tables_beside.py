@@ -141,3 +141,31 @@ def test_a_table_beside_a_capture_without_a_place_is_named(tmp_path):
         f"gps.csv beside the photographs holds positions of {number} of {number}; not used. To use it: --gps {file}"
     ]
     assert not [each for each in load_capture(tmp_path, CaptureOptions(up="z")).warnings if "beside" in each]
+
+
+def test_tables_between_the_given_folder_and_the_photographs_are_found(tmp_path):
+    for k in range(3):
+        (tmp_path / "given/code/images/card").mkdir(parents=True, exist_ok=True)
+        write_photograph(tmp_path / f"given/code/images/card/DJI_{k + 1:04d}.JPG", np.roll(NOISE, 9 * k, 0), k, None)
+    names = [f"DJI_{k + 1:04d}.JPG" for k in range(3)]
+    (tmp_path / "given/code/geo.txt").write_text(TABLES["geo.txt"].format(*names))
+    (tmp_path / "given/code/gcp_list.txt").write_text("EPSG:4326\n")
+    request = SfmRequest(image_folders=(tmp_path / "given",), output=tmp_path / "new", options=SfmOptions())
+    plan = plan_reconstruction(request)
+    assert len(plan.gps_priors) == 3
+    assert any(each.startswith("gcp_list.txt beside the photographs") for each in plan.preflight.warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "is_said"),
+    [
+        ("gcp.txt", "GCP 1,436995.690,4572636.962,289.152,0.02,0.02", True),
+        ("site GCPs.csv", "A1 436995 4572636 289", True),
+        ("gcp.txt", "weather was fine that day", False),
+        ("notes.txt", "GCP 1,436995.690,4572636.962,289.152", False),
+    ],
+)
+def test_surveyed_points_without_marks_are_named_with_what_they_lack(tmp_path, name, line, is_said):
+    _, said = planned(tmp_path, f"card/{name}", f"{line}\n" * 4, placed=True)
+    found = [each for each in said if f"{name} beside the photographs has surveyed points" in each]
+    assert bool(found) == is_said

@@ -309,7 +309,7 @@ def test_what_is_not_used_is_named_with_its_reason(tmp_path):
     found = collect_images([tmp_path])
     reasons = {each.name: each.reason for each in found.excluded}
     assert "cut off" in reasons["cut.jpg"]
-    assert "copy of copy.jpg" in reasons["p03.jpg"]
+    assert "copy of p03.jpg" in reasons["copy.jpg"]
     assert "another ending" in reasons["p04.png"]
     assert (len(found.images), found.other_files) == (6, 1)
 

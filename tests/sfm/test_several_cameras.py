@@ -98,3 +98,44 @@ def test_only_positions_without_an_altitude_are_named_as_such(tmp_path):
     without = [replace(photo, altitude=None, relative_altitude=None) for photo in images]
     bare = read_gps_priors(without, None, (1.0, 2.0)).notes
     assert any("and 3 more: the positions have no altitudes. Positions give" in note for note in bare)
+
+
+def test_overlap_and_pixels_are_those_of_the_wide_lens_where_a_zoom_flies_beside_it(tmp_path):
+    """An H20T's `_W` and `_Z`: of the zoom, three times as long, photographs hardly overlap."""
+    for k in range(8):
+        for letter in "WZ":
+            write_photograph(tmp_path / f"DJI_{k:04d}_{letter}.JPG", pixels(k), 3 * k, np.array([8.0 * k, 0, 40]))
+    found = collect_images([tmp_path])
+    images = [
+        replace(photo, lens=replace(photo.lens, focal=(1 if photo.name.endswith("W.JPG") else 3) * photo.lens.focal))
+        for photo in found.images
+    ]
+    both = replace(found, images=tuple(images))
+    alone = replace(found, images=tuple(photo for photo in images if photo.name.endswith("W.JPG")))
+    one, other = (make_preflight_report(each, read_gps_priors(each.images, None, (1.0, 2.0))) for each in (both, alone))
+    assert one.forward_overlap == pytest.approx(other.forward_overlap)
+    assert one.gsd_m == pytest.approx(other.gsd_m)
+    assert one.views_per_point == pytest.approx(other.views_per_point)
+
+
+def test_flights_that_cover_each_others_gaps_have_none(tmp_path):
+    for k in range(40):
+        place = np.array([20.0 * (k % 4), 3.0 * (k // 4), 40.0])
+        write_photograph(tmp_path / f"DJI_{k:04d}.JPG", pixels(k), 3 * k, place)
+    found = collect_images([tmp_path])
+    assert overlap_of(found) < 0.6
+    assert not any("gaps come" in each for each in said(found))
+
+
+@pytest.mark.parametrize(
+    ("copied", "original"),
+    [("copies", "mavic"), ("a/b", "flight"), ("a (1)", "flight"), ("backup 2023", "flight"), ("flight_copy", "flight")],
+)
+def test_of_copies_the_one_stays_that_does_not_say_that_it_is_one(tmp_path, copied, original):
+    names = flight(tmp_path / original)
+    (tmp_path / copied).mkdir(parents=True)
+    for name in names:
+        (tmp_path / copied / name).write_bytes((tmp_path / original / name).read_bytes())
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images] == [f"{original}/{name}" for name in names]
+    assert found.excluded[0].reason == f"is a copy of {original}/{names[0]}"

@@ -35,7 +35,7 @@ BESIDE_DEG = 3.0
 _ONE_PLACE = 0.2
 #: What is said of systems in feet, where nothing says the unit of heights.
 HEIGHTS_IN_METERS = "; x and y in feet, heights are taken as metres"
-_ALL_IN_FEET = "; x, y and heights in feet"
+ALL_IN_FEET = "; x, y and heights in feet"
 #: What is said of heights above a geoid whose grid is not at hand.
 WITHOUT_GEOID = "; heights as they are, for PROJ lacks the grid of their geoid"
 #: National datums of which nothing more is known differ from WGS 84 by up to so many metres.
@@ -127,7 +127,7 @@ def _name_of_system(crs: Any, header: str, heights_as_xy: bool) -> str:
             "to some hundred metres (an EPSG code, or +towgs84, names it)"
         )
     if len(crs.axis_info) == 2 and crs.is_projected and "foot" in (crs.axis_info[0].unit_name or ""):
-        name += _ALL_IN_FEET if heights_as_xy else HEIGHTS_IN_METERS
+        name += ALL_IN_FEET if heights_as_xy else HEIGHTS_IN_METERS
     return str(name)
 
 

@@ -38,7 +38,7 @@ from vdgs.captures.table_columns import (
     side_letter,
     with_units,
 )
-from vdgs.captures.text_tables import LOOKED_AT, Line, read_lines, rows_of
+from vdgs.captures.text_tables import LOOKED_AT, Line, read_lines, rows_of, with_points_parted
 from vdgs.errors import CaptureError
 
 #: How files begin that have positions but are no tables of them, and what to do.
@@ -113,7 +113,7 @@ def read_gps_table(file: Path) -> GpsTable:
     system, body = _system_and_body(lines)
     if not body:
         raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
-    all_rows = with_units(rows_of(body))
+    all_rows = with_units(with_points_parted(rows_of(body)))
     columns, rows = read_columns(all_rows, system, file)
     if not rows:
         raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")

@@ -18,6 +18,7 @@ from vdgs.captures.formats.source_capture import SourceView
 from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.captures.text_tables import read_lines
 from vdgs.errors import CaptureError
+from vdgs.geometry.ray_intersection import intersect_rays
 
 #: Photographs that must show a point: one view tells a line, no place.
 MIN_OBSERVATIONS = 2
@@ -136,16 +137,6 @@ def scale_of_distances(
             f"{source}: its distances contradict each other by {apart:.0%}. Look at marks and metres again."
         )
     return mean, max(float(1 / np.sqrt(weights.sum())), apart / 2)
-
-
-def intersect_rays(centers: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"] | None:
-    """The point with the least sum of squared distances to lines; None where they are parallel."""
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] < 1e-6:
-        return None
-    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, centers)))
 
 
 def known_scale_of_views(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -10,11 +11,15 @@ from typing import NamedTuple
 from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_columns import NoSystem
 from vdgs.captures.gps_tables import BY_TIME, GpsRow, read_gps_table
+from vdgs.captures.text_tables import read_lines
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
 
 #: What ODM calls its table and its list.
 ODM_POSITIONS, ODM_CONTROL_POINTS = "geo.txt", "gcp_list.txt"
+#: How files of surveyed points are called, and a line of a name, x, y, z and accuracies.
+_POINTS_NAME = re.compile(r"(^|[^a-z])gcps?([^a-z]|$)|ground.?control|control.?points?|passpunkte", re.I)
+_POINT = re.compile(r"\s*[^,;\t]+?(?:\s*[,;\t]\s*|\s+)[-+]?\d+\.?\d*(?:(?:\s*[,;\t]\s*|\s+)[-+]?\d+\.?\d*){2,4}\s*$")
 #: Positions of fewer photographs are not worth a word.
 _MIN_ROWS = 3
 _SUFFIXES = frozenset({".txt", ".csv", ".tsv", ".mrk"})
@@ -73,9 +78,28 @@ def track_notes(folders: Iterable[Path]) -> list[str]:
     return found
 
 
-def control_points_beside(folders: Iterable[Path]) -> Path | None:
-    """ODM's list of control points in one of the folders."""
-    return next((file for file in _candidates(folders) if file.name.lower() == ODM_CONTROL_POINTS), None)
+def control_point_notes(folders: Iterable[Path]) -> list[str]:
+    """How to use ODM's list of control points in one of the folders, or else what surveyed points without their marks
+    (Pix4D's gcp.txt) need to be used."""
+    files = _candidates(folders)
+    points = next((file for file in files if file.name.lower() == ODM_CONTROL_POINTS), None)
+    if points is not None:
+        return [f"{points.name} beside the photographs is not used. To use it: --gcp {shell_word(points)}"]
+    alone = next((file for file in files if _POINTS_NAME.search(file.stem) and _has_points_alone(file)), None)
+    if alone is None:
+        return []
+    return [
+        f"{alone.name} beside the photographs has surveyed points, and not where photographs show them; not used. To "
+        "use them, mark them: --gcp takes a line that names the system, and lines `x y z px py photograph name`."
+    ]
+
+
+def _has_points_alone(file: Path) -> bool:
+    """Whether most lines of a file are a name and three numbers or more, and no photograph."""
+    with suppress(CaptureError):
+        lines = [line.text for line in read_lines(file, "surveyed points") if line.text.strip()]
+        return len(lines) > 2 and 2 * sum(bool(_POINT.match(line)) for line in lines) > len(lines)
+    return False
 
 
 def table_note(table: TableBeside, number: int) -> str:

@@ -26,6 +26,10 @@ _NAME_WITH_BLANKS = re.compile(
     r"\s*([^\"#][^\"]*?\.(?:jpe?g|png|tiff?|webp|avif|dng|cr[23]|nef|arw|raf|orf|rw2|hei[cf]|hif))\s+(?=\S)",
     re.IGNORECASE,
 )
+#: A point in WKT (OGC's simple features), with z and m or without.
+_WKT_POINT = re.compile(
+    r"\s*(?:SRID=\d+;)?POINT\s*Z?M?\s*\(\s*([-+.\deE]+)\s+([-+.\deE]+)(?:\s+[-+.\deE]+)*\s*\)\s*", re.IGNORECASE
+)
 #: Lines that are looked at for the separator.
 LOOKED_AT = 20
 
@@ -130,3 +134,19 @@ def _has_decimal_commas_only(lines: Sequence[str]) -> bool:
     return all(
         len(words) > 2 and all(_DECIMAL_COMMA.fullmatch(word) for word in words if "," in word) for words in parted
     )
+
+
+def with_points_parted(rows: Sequence[Row]) -> list[Row]:
+    """Rows below one of headings whose column of points in WKT (`POINT (8.5 47.1)`, as QGIS writes geometries) is
+    parted into columns X and Y; others stay."""
+    if len(rows) < 2:
+        return list(rows)
+    for k in range(len(rows[0].words)):
+        points = [_WKT_POINT.fullmatch(row.words[k]) if k < len(row.words) else None for row in rows[1:]]
+        if all(points):
+            parted = [["X", "Y"], *([point[1], point[2]] for point in points if point is not None)]
+            return [
+                Row(row.number, [*row.words[:k], *pair, *row.words[k + 1 :]])
+                for row, pair in zip(rows, parted, strict=True)
+            ]
+    return list(rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from pathlib import PurePosixPath
 
 #: What Google Photos puts behind the name of what was edited, in the languages of its users; for regular expressions.
 EDITED_WORDS = "|".join(
@@ -24,6 +25,12 @@ _COPY_OF = re.compile(
     r"(?:copy[ _]of|kopie[ _]v[ao]n|copie[ _]de|c[oó]pia[ _]d[eio]|kopia|kopi[ _]a[vf]|копия)[ _]+(?P<first>.+)",
     re.IGNORECASE,
 )
+#: How people name folders of copies.
+_COPY_FOLDER = re.compile(
+    r"(?:^|[\W_])(?:cop(?:y|ies)|copie|kopien?|copias?|backups?|bak|duplicates?|doubles?|sicherung)(?:[\W_\d]|$)"
+    r"|\(\d{1,2}\)$",
+    re.IGNORECASE,
+)
 #: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
 _EDITED_ON_PHONE = re.compile(r"(.*\bIMG_)E(\d{4})", re.IGNORECASE)
 
@@ -39,3 +46,8 @@ def first_stems(stem: str) -> list[str]:
     if match := _COPY_NAME.fullmatch(stem):
         return list(dict.fromkeys((f"{match['first']}{match['double'] or ''}".lower(), match["first"].lower())))
     return []
+
+
+def say_copy(path: PurePosixPath) -> bool:
+    """Whether the name of a photograph, or of a folder that it is in, says that it is a copy."""
+    return bool(first_stems(path.stem)) or any(map(_COPY_FOLDER.search, (*path.parts[:-1], path.stem)))

@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from vdgs.captures.known_distances import MIN_OBSERVATIONS, intersect_rays
+from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.plane_fit import fit_plane, in_plane
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.errors import CaptureError
+from vdgs.geometry.ray_intersection import intersect_rays
 from vdgs.geometry.similarity import Similarity, fit_similarity, fit_similarity_robust, is_collinear, rotation_to_z
 from vdgs.sfm.bending import bend_to_points
 from vdgs.sfm.gcp_list import MIN_CONTROL_POINTS, GcpList, GcpObservation, GroundControlPoint, are_along_line
@@ -189,7 +190,7 @@ def adjust_to_gcps(
     against it. Raises CaptureError for what it says, where marks fit nothing, and where fewer than three of the points
     are seen by placed photographs, or they lie along a line.
     """
-    targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
+    targets, located = gcps.enu(origin), triangulate_all(model, gcps)
     control = {k: seen for k, seen in located.items() if not gcps.points[k].is_check_point}
     wrong = [k for k, seen in control.items() if seen.kept_px > _useless_px(model)]
     used = {k: seen for k, seen in control.items() if k not in wrong}
@@ -198,7 +199,7 @@ def adjust_to_gcps(
     rows = np.array(list(used), int)
     _check_enough(targets[rows], len(wrong), gcps.source)
     places = np.array([seen.position for seen in used.values()])
-    fit = fit_surveyed(places, targets[rows], level, _pixel_at(model, list(used.values())))
+    fit = fit_surveyed(places, targets[rows], level, pixel_at(model, list(used.values())))
     said = doubts(fit.similarity, places[fit.trusted], fit.aims[fit.trusted]) if doubts is not None else ""
     if said:
         raise CaptureError(f"{gcps.source}: {said} {ANYWAY_GCP}")
@@ -310,7 +311,7 @@ def _useless_px(model: pycolmap.Reconstruction) -> float:
     return max(MARK_WRONG_PX, MARK_USELESS * longest)
 
 
-def _pixel_at(model: pycolmap.Reconstruction, seen: Sequence[TriangulatedPoint]) -> float:
+def pixel_at(model: pycolmap.Reconstruction, seen: Sequence[TriangulatedPoint]) -> float:
     """What a pixel shows at points, the median in the model's unit; 0 without points."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     sizes = [
@@ -415,7 +416,7 @@ def measure_gcps(
 ) -> tuple[GcpReport, ...]:
     """What a placed model makes of all points: seen minus surveyed, metres east, north, and up unless nothing says how
     high the model lies."""
-    targets, located = gcps.enu(origin), _triangulate_all(model, gcps)
+    targets, located = gcps.enu(origin), triangulate_all(model, gcps)
     if not knows_altitude:
         targets[:, 2] = np.nan
     facts = []
@@ -430,7 +431,8 @@ def measure_gcps(
     return tuple(facts)
 
 
-def _triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int, TriangulatedPoint]:
+def triangulate_all(model: pycolmap.Reconstruction, gcps: GcpList) -> dict[int, TriangulatedPoint]:
+    """The points that placed photographs show (`triangulate`), by their number in the list."""
     found = ((k, triangulate(model, point)) for k, point in enumerate(gcps.points))
     return {k: seen for k, seen in found if seen is not None}
 

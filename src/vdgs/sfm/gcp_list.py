@@ -15,10 +15,13 @@ from jaxtyping import Float
 
 from vdgs.captures.column_units import believed_units, in_units_of, named_in_units
 from vdgs.captures.coordinate_systems import (
+    ALL_IN_FEET,
+    HEIGHTS_IN_METERS,
     datum_error,
     height_unit,
     outside_area,
     to_geodetic,
+    unit_without_heights,
 )
 from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.name_resolution import NameLookup, find_one
@@ -83,6 +86,10 @@ class GcpList:
     notes: tuple[str, ...]
     datum_error_m: float = 0.0
     """How far all points may be off by the datum of their system."""
+    header: str = ""
+    """The definition of the system as the file has it."""
+    unsaid_height_unit_m: float | None = None
+    """Metres in the feet of x and y where nothing says the unit of heights, which are read as metres."""
 
     @property
     def has_control_points(self) -> bool:
@@ -92,6 +99,14 @@ class GcpList:
     def has_heights(self) -> bool:
         """Whether control points say how high the place is."""
         return any(not point.is_check_point and math.isfinite(point.geodetic[2]) for point in self.points)
+
+    def with_heights_in(self, unit_m: float) -> GcpList:
+        """The list with heights that were read as metres in a unit of so many metres, that of x and y."""
+        points = tuple(
+            replace(point, geodetic=(*point.geodetic[:2], point.geodetic[2] * unit_m)) for point in self.points
+        )
+        crs = self.crs.replace(HEIGHTS_IN_METERS, ALL_IN_FEET)
+        return replace(self, points=points, crs=crs, unsaid_height_unit_m=None)
 
     def enu(self, origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
         """All points in metres east, north, up of an origin; up is NaN of points without a height."""
@@ -132,7 +147,7 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
     are not there, pixels outside them, names that are not there, and points that are too few or along a line.
     """
-    header, lines, transform, system, note = _listed(file)
+    header, lines, transform, system, note, unsaid = _listed(file)
     by_name = photographs_by_name(collection)
     lines, strange = _of_photographs(lines, by_name, file)
     found = [(line, find_sighting(line.pixel, line.photograph, line.number, by_name, file)) for line in lines]
@@ -152,7 +167,8 @@ def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]
     strange += [f"{file.name}: {said}" for said in outside_area(header, places)]
     error_m, converted = datum_error(header, places)
     strange += [f"{file.name}: points are {converted}."] if converted else []
-    return replace(_checked(points, system, file, strange), datum_error_m=error_m)
+    checked = _checked(points, system, file, strange)
+    return replace(checked, datum_error_m=error_m, header=header, unsaid_height_unit_m=unsaid)
 
 
 class _Listed(NamedTuple):
@@ -165,6 +181,8 @@ class _Listed(NamedTuple):
     system: str
     note: str
     """What is said of the unit of x and y."""
+    unsaid_height_unit_m: float | None
+    """Metres in the feet of x and y where nothing says the unit of heights."""
 
 
 def _listed(file: Path) -> _Listed:
@@ -176,7 +194,9 @@ def _listed(file: Path) -> _Listed:
     units, note = believed_units(header, (across, along), places, file)
     wide, long = (in_units_of(header, unit, file) for unit in units)
     lines = [replace(line, place=(line.place[0] * wide, line.place[1] * long, line.place[2])) for line in lines]
-    return _Listed(header, lines, transform, named_in_units(system, units, up), note)
+    name = named_in_units(system, units, up)
+    unsaid = unit_without_heights(header) if up is None and name.endswith(HEIGHTS_IN_METERS) else None
+    return _Listed(header, lines, transform, name, note, unsaid)
 
 
 def _by_point(found: Sequence[_Marked]) -> list[tuple[str, list[_Marked]]]:

@@ -19,7 +19,9 @@ from vdgs.sfm import gcp_adjustment, georegistration
 from vdgs.sfm.attitude_readings import confirmed_by_model
 from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.bending import bend_to_positions, tell_level
+from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
+from vdgs.sfm.height_units import GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M, of_gps, with_height_unit
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
@@ -35,8 +37,6 @@ WITHOUT = (
 MOST_OFF = 0.1
 #: Up by control points and by the photographs may differ by so many degrees (choice).
 MOST_TILTED_DEG = 60.0
-#: GPS is wrong by no more than this many metres across and, geoids among it, up; no heights by more than the last.
-GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M = 100.0, 150.0, 1000.0
 #: Scales that differ by so much (share) beside what they may be wrong by contradict each other (choice).
 SCALES_APART = 0.1
 #: A ratio so near to that of feet and metres is one (share).
@@ -52,6 +52,8 @@ class Georeferenced:
     origin: tuple[float, float, float] | None
     """Latitude and longitude in degrees, altitude in metres; None where they are not known."""
     survey: tuple[GcpReport, ...]
+    control: GcpList | None
+    """Surveyed points as they were read: in the unit of heights that the model tells."""
     photographs: tuple[ImageMetadata, ...]
     """Those of the plan, with attitudes by the readings that the model confirms."""
     notes: tuple[str, ...] = ()
@@ -66,18 +68,22 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     drop_unseen_observations(model)
     photographs, notes = confirmed_by_model(model, prepared.image_list.images)
     prepared = replace(prepared, image_list=replace(prepared.image_list, images=photographs))
+    doubts = Doubts.of(model, prepared) if prepared.gcps is not None else None
+    if doubts is not None:
+        prepared, of_heights = _with_height_unit(model, prepared, doubts)
+        doubts, notes = replace(doubts, altitude=prepared.origin[2]), (*notes, *of_heights)
     control = prepared.gcps
     doubtful = frozenset[str]()
     placed: Georegistration | AlignmentFailure
-    if control is not None and control.has_control_points:
-        model, placed, doubtful = _by_control(model, prepared, hold_focal)
+    if doubts is not None and control is not None and control.has_control_points:
+        model, placed, doubtful = _by_control(model, prepared, hold_focal, doubts)
     else:
         placed = _by_positions(model, prepared)
         if isinstance(placed, Georegistration):
             georegistration.transform_model(model, placed.similarity)
             model, placed = _bent(model, placed, prepared, hold_focal)
     if isinstance(placed, AlignmentFailure):
-        return Georeferenced(model, _upright(model, photographs, placed), None, (), photographs, notes)
+        return Georeferenced(model, _upright(model, photographs, placed), None, (), control, photographs, notes)
     survey: tuple[GcpReport, ...] = ()
     if control is not None and placed.is_georeferenced:
         survey = gcp_adjustment.measure_gcps(
@@ -89,7 +95,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     latitude, longitude, altitude = prepared.origin
     altitude = altitude + ground if _knows_altitude(prepared, placed) else 0.0
     origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
-    return Georeferenced(model, placed, origin, survey, photographs, notes)
+    return Georeferenced(model, placed, origin, survey, control, photographs, notes)
 
 
 def _upright(
@@ -201,13 +207,27 @@ def _bent(
     return bent, replace(placed, residuals=lies.residuals + off[:, : lies.residuals.shape[1]])
 
 
+def _with_height_unit(
+    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, doubts: Doubts
+) -> tuple[ReconstructionPlan, list[str]]:
+    """The plan with surveyed heights in the unit that model and GPS tell, where the list says none, and what to say of
+    that. With `--georeference anyway` the list is used as it is."""
+    control = prepared.gcps
+    if control is None or control.unsaid_height_unit_m is None:
+        return prepared, []
+    anyway = prepared.request.options.georeference == "anyway"
+    seen = {} if anyway else gcp_adjustment.triangulate_all(model, control)
+    located, pixel = {k: each.position for k, each in seen.items()}, gcp_adjustment.pixel_at(model, list(seen.values()))
+    read, note = with_height_unit(control, located, prepared.origin, pixel, doubts.by_gps, doubts.gps)
+    return replace(prepared, gcps=read), [note] if note else []
+
+
 def _by_control(
-    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool
+    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool, doubts: Doubts
 ) -> tuple[pycolmap.Reconstruction, Georegistration, frozenset[str]]:
     photographs, control = prepared.image_list.images, prepared.gcps
     assert control is not None
     anyway = prepared.request.options.georeference == "anyway"
-    doubts = Doubts.of(model, prepared)
     gps = doubts.by_gps
     place = gps.accuracy.place_m if gps is not None and gps.accuracy is not None else None
     level = gcp_adjustment.Level(
@@ -224,6 +244,7 @@ def _by_control(
     placed = georegistration.registration_in_place(
         found.model, photographs, prepared.gps_priors, found.how, found.accuracy, notes
     )
+    placed = replace(placed, notes=(*notes, *of_gps(placed, gps, control.source, doubts.gps)))
     return found.model, placed, found.doubtful
 
 

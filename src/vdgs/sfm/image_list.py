@@ -22,6 +22,7 @@ from vdgs.config.sfm_options import Brackets, CameraModel
 from vdgs.errors import CaptureError
 from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked, strays
+from vdgs.sfm.edited_names import say_copy
 from vdgs.sfm.find_images import (
     check_decoders,
     find_files,
@@ -280,26 +281,31 @@ def _read(
 
 def _drop_duplicates(photographs: list[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
     """Leave out copies of the same file, the same photograph with another ending, and names that differ in upper and
-    lower case only."""
+    lower case only. Of copies that one stays whose name and folders do not say that it is one, else the shallower."""
     kept, left_out = list[ImageMetadata](), list[ExcludedImage]()
     groups = find_copies([photo.path for photo in photographs])
     group_of = {photographs[k].name: number for number, group in enumerate(groups) for k in group}
-    firsts, stems = dict[int, str](), dict[str, list[ImageMetadata]]()
+    firsts = {k: min((photographs[i].name for i in group), key=_by_originality) for k, group in enumerate(groups)}
+    stems = dict[str, list[ImageMetadata]]()
     for photo in photographs:
         group = group_of.get(photo.name)
         alike = stems.setdefault(match_key(photo.name), [])
-        if group in firsts:
+        if group is not None and firsts[group] != photo.name:
             why = f"is a copy of {firsts[group]}"
         else:
             why = next(filter(None, (_why_same(photo, other) for other in alike)), "")
         if why:
             left_out.append(ExcludedImage(photo.name, why))
             continue
-        if group is not None:
-            firsts[group] = photo.name
         alike.append(photo)
         kept.append(photo)
     return kept, left_out
+
+
+def _by_originality(name: str) -> tuple[bool, int, str]:
+    """The order of names of one file, the likeliest original first."""
+    path = PurePosixPath(name)
+    return say_copy(path), len(path.parts), name
 
 
 def _why_same(photo: ImageMetadata, other: ImageMetadata) -> str:

@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 
 from vdgs.captures.image_files import open_image, same_aspect
 from vdgs.sfm.brackets import SAME_STOPS
-from vdgs.sfm.edited_names import first_stems
+from vdgs.sfm.edited_names import first_stems, say_copy
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.rig_folders import may_be_sensor
 
@@ -217,7 +217,12 @@ def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
         path = PurePosixPath(photo.name)
         folders.setdefault(str(path.parent), {})[path.stem.lower()] = photo
     found, kept = dict[str, str](), list[tuple[str, dict[str, ImageMetadata]]]()
-    for folder in sorted(folders, key=lambda each: (_are_raw(folders[each]), -len(folders[each]), len(each), each)):
+
+    def order(folder: str) -> tuple[bool, int, bool, int, str]:
+        is_copy = say_copy(PurePosixPath(folder) / "photograph")
+        return _are_raw(folders[folder]), -len(folders[folder]), is_copy, len(folder), folder
+
+    for folder in sorted(folders, key=order):
         for name, other in kept:
             if may_be_sensor(folder) and may_be_sensor(name):
                 continue

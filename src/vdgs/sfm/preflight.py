@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import statistics
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import PurePosixPath
@@ -28,6 +28,9 @@ MIN_OVERLAP = 0.6
 MIN_VIEWS_PER_POINT = 4.0
 #: Where fewer photographs (share) have positions, the steps between these are not those of the flight (choice).
 MIN_POSITIONED = 0.9
+#: A lens that took this share of the photographs took many; another shows plainly less from so many times its focal
+#: length on (choice).
+MANY_OF_LENS, LONGER = 0.2, 1.5
 #: Positions whose stated error across is smaller (metres) were corrected, as they were taken or afterwards (choice).
 RTK_M = 0.2
 #: Views farther from straight down than this are oblique (degrees).
@@ -87,14 +90,16 @@ def make_preflight_report(collection: ImageList, positions: GpsPriors) -> Prefli
     heights, height_from = flying_heights(photographs)
     height = statistics.median(heights) if heights else None
     tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
-    tilt, pixel = _median(tilts), _pixel_rad(photographs)
+    wide = _by_widest_lens(photographs)
+    tilt, pixel = _median(tilts), _pixel_rad(wide)
     away = _distance_of_ground(height, tilt)
-    footprint = _footprint(photographs, away)
+    footprint = _footprint(wide, away)
     days = sorted({f"{when:%Y-%m-%d}" for when in _moments(photographs)})
     accuracies = [max(photo.gps_std[:2]) for photo in photographs if photo.gps_std is not None]
     # What positions tell of the flight needs those of nearly all photographs.
     shown = footprint if len(positions) >= MIN_POSITIONED * len(photographs) else None
-    overlap, views = _overlap(photographs, positions, shown), _views_per_place(positions, shown)
+    overlap = _overlap(photographs, positions, shown, {photo.name for photo in wide})
+    views = _views_per_place(positions, shown, len(wide) / max(1, len(photographs)))
     return PreflightReport(
         num_images=len(photographs),
         num_masks=sum(photo.mask is not None for photo in photographs),
@@ -145,6 +150,17 @@ def _distance_of_ground(height: float | None, tilt_deg: float | None) -> float |
     return height / float(np.cos(np.radians(tilt_deg or 0.0)))
 
 
+def _by_widest_lens(photographs: Sequence[ImageMetadata]) -> list[ImageMetadata]:
+    """The photographs by the widest lens that took many of them, and by lenses nearly as wide: what a zoom beside it
+    shows overlaps less, and is in the pictures of that lens."""
+    focals = [photo.lens.focal if photo.lens else None for photo in photographs]
+    known = sorted(focal for focal in focals if focal)
+    if not known:
+        return list(photographs)
+    most = LONGER * known[int(MANY_OF_LENS * len(known))]
+    return [photo for photo, focal in zip(photographs, focals, strict=True) if focal is None or focal <= most]
+
+
 def _pixel_rad(photographs: Sequence[ImageMetadata]) -> float | None:
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return 1 / focal if focal else None
@@ -164,10 +180,13 @@ def _footprint(photographs: Sequence[ImageMetadata], away: float | None) -> tupl
 
 
 def _overlap(
-    photographs: Sequence[ImageMetadata], positions: GpsPriors, footprint: tuple[float, float] | None
+    photographs: Sequence[ImageMetadata],
+    positions: GpsPriors,
+    footprint: tuple[float, float] | None,
+    counted: Collection[str],
 ) -> float | None:
-    """Along the flight, if the shorter side points forwards: from the steps between photographs in order of time, of
-    each flight and camera for itself."""
+    """Along the flight, if the shorter side points forwards: from the steps between the photographs that are counted,
+    by their names, in order of time, of each flight and camera for itself."""
     if footprint is None or len(positions) < 3:
         return None
     taken = [photographs[index] for index in positions.image_indices.tolist()]
@@ -175,6 +194,8 @@ def _overlap(
     pairs = list[tuple[int, int]]()
     lenses = _lenses_of(taken)
     for k in time_order(taken):
+        if taken[k].name not in counted:
+            continue
         if lenses[k] in before:
             pairs.append((before[lenses[k]], k))
         before[lenses[k]] = k
@@ -197,17 +218,20 @@ def _lenses_of(photographs: Sequence[ImageMetadata]) -> list[int]:
     return [numbers[key] for key in keys]
 
 
-def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None) -> float | None:
+def _views_per_place(positions: GpsPriors, footprint: tuple[float, float] | None, share: float) -> float | None:
+    """By how many of the photographs a place is seen, of which a `share` shows the `footprint`."""
     if footprint is None or not positions.usable:
         return None
     area = MultiPoint(positions.enu[:, :2]).convex_hull.buffer(min(footprint) / 4).area
-    return float(min(len(positions), len(positions) * footprint[0] * footprint[1] / area))
+    count = share * len(positions)
+    return float(min(count, count * footprint[0] * footprint[1] / area))
 
 
 def _warnings(collection: ImageList, overlap: float | None, views: float | None, days: Sequence[str]) -> list[str]:
     photographs = collection.images
     found = [*_of_lenses(photographs), *_of_files(photographs)]
-    if overlap is not None and overlap < MIN_OVERLAP:
+    is_covered = views is not None and views >= 2 * MIN_VIEWS_PER_POINT  # by another drone, or strips across
+    if overlap is not None and overlap < MIN_OVERLAP and not is_covered:
         found.append(f"they overlap by about {overlap:.0%} along the flight; below {MIN_OVERLAP:.0%} gaps come.")
     if views is not None and views < MIN_VIEWS_PER_POINT:
         found.append(

@@ -17,7 +17,7 @@ from vdgs.captures.reconstruction import (
     WORK_FOLDER,
     is_reconstruction,
 )
-from vdgs.captures.tables_beside import ODM_POSITIONS, control_points_beside, position_tables, table_note, track_notes
+from vdgs.captures.tables_beside import ODM_POSITIONS, control_point_notes, position_tables, table_note, track_notes
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
@@ -30,7 +30,6 @@ from vdgs.sfm.image_list import ImageList, collect_images
 from vdgs.sfm.panoramas import with_views
 from vdgs.sfm.preflight import PreflightReport, make_preflight_report
 from vdgs.sfm.scale_bars import ScaleBars, read_scale_bars
-from vdgs.system.quoting import shell_word
 from vdgs.system.units import data_size
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
@@ -91,12 +90,10 @@ def plan_reconstruction(request: SfmRequest) -> ReconstructionPlan:
 def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[SfmRequest, list[str]]:
     """The request with ODM's table of positions, where it lies beside photographs that have none of their own; and what
     to say of tables and lists that lie there."""
-    folders = [*collection.folders, *(photo.path.parent for photo in collection.images)]
-    folders += [folder.resolve().parent for folder in collection.folders]
+    folders = _folders_of(collection)
     notes, options = list[str](), request.options
-    points = None if options.gcp is not None else control_points_beside(folders)
-    if points is not None and options.georeference != "off":
-        notes.append(f"{points.name} beside the photographs is not used. To use it: --gcp {shell_word(points)}")
+    if options.gcp is None and options.georeference != "off":
+        notes += control_point_notes(folders)
     if request.gps is not None or options.georeference == "off":
         return request, notes
     tables = position_tables(folders, [photo.name for photo in collection.images], without_system=True)
@@ -110,6 +107,19 @@ def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[Sfm
         return replace(request, gps=used.file), notes
     notes += [table_note(table, number) for table in tables]
     return request, notes if tables or placed >= MIN_POSITIONS else [*notes, *track_notes(folders)]
+
+
+def _folders_of(collection: ImageList) -> list[Path]:
+    """Where tables of photographs may lie: the folders given, those of the photographs, those between, and those that
+    hold the folders given."""
+    roots = {folder.resolve() for folder in collection.folders}
+    own = list(dict.fromkeys(photo.path.parent for photo in collection.images))
+    between = list[Path]()
+    for folder in own:
+        above = [folder.resolve(), *folder.resolve().parents]
+        inside = next((k for k, each in enumerate(above) if each in roots), 0)
+        between += [each for each in folder.parents[: max(0, inside - 1)] if each not in between]
+    return [*collection.folders, *own, *between, *(root.parent for root in roots)]
 
 
 def _check_marks(options: SfmOptions, collection: ImageList) -> None:

@@ -18,6 +18,7 @@ from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.fisheyes import MAX_FISHEYE_MM, equivalent_mm
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
+from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
@@ -98,7 +99,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         components=tuple(result.components), pairs=result.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
         reprojection_px=mean_reprojection_error(model), georeferenced=georeferenced,
-        altitude_reference=_altitudes(plan, placed) if placed and placed.is_georeferenced else "",
+        altitude_reference=_altitudes(plan, result.found.control, placed) if placed and placed.is_georeferenced else "",
         origin=result.found.origin,
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
         focal_fixed=held[0], focal_reason=held[1], height_m=height,
@@ -163,8 +164,7 @@ def check_enough_placed(model: pycolmap.Reconstruction, left_out: Sequence[Exclu
         )
 
 
-def _altitudes(prepared: ReconstructionPlan, placed: Georegistration) -> str:
-    control = prepared.gcps
+def _altitudes(prepared: ReconstructionPlan, control: GcpList | None, placed: Georegistration) -> str:
     if control is not None and control.has_control_points:
         return f"heights as in {control.source} ({control.crs})"
     if placed.accuracy is not None and placed.accuracy.altitude == "none":

@@ -23,6 +23,7 @@ from vdgs.captures.formats.brown_lens import brown_intrinsics, quarter_turn_fish
 from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
+from vdgs.captures.formats.surveyed_points import survey_note
 from vdgs.captures.formats.terra import local_origin, original_names, warn_of_undistorted
 from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
 from vdgs.captures.system_names import is_local_system
@@ -82,10 +83,10 @@ class _Block:
         self._photos: dict[str, _Photo] = {}
         self._without_pose: list[str] = []
         self._refused: dict[str, list[str]] = {}
-        self._masks, self._unknown = 0, ""
+        self._masks, self._control_points, self._unknown = 0, 0, ""
         self._points, self._colors = array("d"), array("d")
         self._systems: set[str] = set()
-        handlers = {"Photogroup": self._photogroup, "TiePoint": self._tie_point, "ControlPoint": self._skip}
+        handlers = {"Photogroup": self._photogroup, "TiePoint": self._tie_point, "ControlPoint": self._control_point}
         self._root = read_xml(file, handlers)
         for path in self._root.iterfind("Block/TiePoints/Path"):
             points = PurePosixPath((path.text or "").strip().replace("\\", "/")).name
@@ -105,6 +106,7 @@ class _Block:
         if self._masks:
             warnings.append(f"{self._masks} masks that the file names are not read; those in masks/ are (--masks).")
         warnings += warn_of_undistorted(self._file, views, originals)
+        warnings += survey_note(self._control_points, "control points", "")
         return Project(
             format="blocks-exchange", file=self._file, views=views,
             points=np.array(self._points).reshape(-1, 3),
@@ -132,8 +134,9 @@ class _Block:
             sightings=(np.array(numbers, np.int64), np.array(pixels, np.float64).reshape(-1, 2)) if numbers else None,
         )  # fmt: skip
 
-    def _skip(self, element: Element) -> None:
-        """Control points are not used: poses are adjusted to them already."""
+    def _control_point(self, _: Element) -> None:
+        """Only counted: poses are mostly adjusted to them already."""
+        self._control_points += 1
 
     # ------------------------------------------------------------------------------------- photographs
 

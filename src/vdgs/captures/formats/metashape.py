@@ -3,8 +3,8 @@ cameras, and where the chunk lies.
 
 A camera's `transform` is camera to chunk, OpenCV's axes; that of a slave is its master's, times where its sensor is in
 the master's axes. The transform of the component, or of the chunk, leads on to Earth-centred metres of the datum of the
-chunk's coordinate system, or to local metres. An export holds no tie points. What it says of masks, regions, markers
-and depth maps is not used.
+chunk's coordinate system, or to local metres. An export holds no tie points. What it says of masks, regions and
+depth maps is not used, and markers are only compared with the poses.
 """
 
 from __future__ import annotations
@@ -21,7 +21,15 @@ import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, geocentric_to_geodetic, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsics
-from vdgs.captures.formats.metashape_project import ALIGNED, PROJECTS, StoredChunk, is_aligned, read_chunks
+from vdgs.captures.formats.metashape_markers import marker_note
+from vdgs.captures.formats.metashape_project import (
+    ALIGNED,
+    PROJECTS,
+    StoredChunk,
+    exported_chunk,
+    is_aligned,
+    read_chunks,
+)
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
@@ -35,7 +43,7 @@ from vdgs.geometry.similarity import Similarity
 _PERSPECTIVE, _EQUISOLID = "frame", "equisolid_fisheye"
 _FISHEYES = ("fisheye", "equidistant_fisheye", _EQUISOLID)
 #: Parts of an export that no reader needs, dropped as they come: they may be long.
-_UNUSED = ("frames", "markers", "shapes", "region", "depth_maps_sets")
+_UNUSED = ("shapes", "region", "depth_maps_sets")
 #: A chunk without a coordinate system whose origin is so far from that of its transform is on the globe (metres).
 _ON_GLOBE_M = (SEMI_MAJOR_M - 60_000, SEMI_MAJOR_M + 60_000)
 #: The unit of a local coordinate system and the metres in one.
@@ -72,7 +80,7 @@ def read(file: Path, options: CaptureOptions) -> Project:
         chunks = read_chunks(file)
     else:
         root = read_xml(file, {name: lambda _: None for name in _UNUSED})
-        chunks = [StoredChunk(chunk) for chunk in root.iter("chunk")]
+        chunks = [exported_chunk(chunk) for chunk in root.iter("chunk")]
     aligned = [chunk for chunk in chunks if chunk.element.find(".//camera/transform") is not None]
     if not aligned:
         raise CaptureError(
@@ -139,6 +147,7 @@ class _Chunk:
         ties = self._stored.tie_points()
         refused: dict[str, list[str]] = {}
         views: list[ProjectView] = []
+        by_number: dict[str, ProjectView] = {}
         for camera in cameras:
             lens = lenses[camera.sensor]
             try:
@@ -150,7 +159,10 @@ class _Chunk:
                 continue
             shown = ties.shown.get(camera.element.get("id", ""))
             views.append(ProjectView(names=camera.names, intrinsics=lens, camera_from_world=pose, sightings=shown))
+            by_number[camera.element.get("id", "")] = views[-1]
         geodetic, words, frames = self._system(place) if place is not None else (None, "", ())
+        markers, marks = self._element.iterfind("markers//marker"), self._stored.marks
+        self._warnings += marker_note(markers, marks, by_number, self._wkt, geodetic, self._file)
         return Project(
             format="metashape", file=self._file, views=tuple(views), colors=ties.colors,
             points=ties.points if place is None else place.apply(ties.points), to_geodetic=geodetic,

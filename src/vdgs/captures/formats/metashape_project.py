@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from vdgs.captures.formats.metashape_markers import Marks, marks_of
 from vdgs.captures.formats.ply_reader import GRAY, read_vertices, vertex_colors
 from vdgs.captures.formats.xml_documents import holds, read_xml
 from vdgs.errors import CaptureError
@@ -39,13 +40,14 @@ class TiePoints:
 
 @dataclass(frozen=True, eq=False)
 class StoredChunk:
-    """A chunk, whether a person worked on it last, the paths of its photographs by camera, and what reads its tie
-    points."""
+    """A chunk, whether a person worked on it last, the paths of its photographs by camera, what reads its tie points,
+    and the marks of its markers in its photographs."""
 
     element: Element
     is_active: bool = False
     photographs: dict[str, str] = field(default_factory=dict)
     tie_points: Callable[[], TiePoints] = TiePoints
+    marks: Marks = field(default_factory=dict)
 
 
 def is_aligned(file: Path) -> bool:
@@ -107,14 +109,25 @@ def _active(document: Element) -> str | None:
     return chunks.get("active_id") if chunks is not None else None
 
 
+def exported_chunk(chunk: Element) -> StoredChunk:
+    """A chunk of an export of cameras."""
+    marks = marks_of(chunk.find("frames/frame"))
+    _drop_frames(chunk)
+    return StoredChunk(chunk, marks=marks)
+
+
+def _drop_frames(chunk: Element) -> None:
+    for frames in chunk.findall("frames"):
+        chunk.remove(frames)  # their cameras are those of the chunk once more
+
+
 def _stored(chunk: Element, is_active: bool, frame: Element | None, archive: Path | None) -> StoredChunk:
     photographs: dict[str, str] = {}
     for camera in frame.iterfind("cameras/camera") if frame is not None else ():
         photo = camera.find("photo")
         if photo is not None and photo.get("path"):
             photographs[camera.get("camera_id", "")] = photo.get("path", "")
-    for frames in chunk.findall("frames"):
-        chunk.remove(frames)  # their cameras are those of the chunk once more
+    _drop_frames(chunk)
     cloud = frame.find("point_cloud") if frame is not None and archive is not None else None
 
     def tie_points() -> TiePoints:
@@ -123,7 +136,7 @@ def _stored(chunk: Element, is_active: bool, frame: Element | None, archive: Pat
         manifest = cloud if archive.suffix.lower() == ".psz" else read_xml(archive)
         return TiePoints() if manifest is None else _read_points(archive, manifest)
 
-    return StoredChunk(chunk, is_active, photographs, tie_points)
+    return StoredChunk(chunk, is_active, photographs, tie_points, marks_of(frame))
 
 
 def _read_points(archive: Path, manifest: Element) -> TiePoints:

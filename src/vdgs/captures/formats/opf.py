@@ -35,6 +35,7 @@ from vdgs.captures.formats.json_poses import (
 from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, safe_name
+from vdgs.captures.formats.surveyed_points import survey_note
 from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -90,6 +91,7 @@ def read(file: Path, options: CaptureOptions) -> Project:
     rolling = sum(_rolls(camera.get("rolling_shutter")) for camera in calibrated["cameras"])
     if rolling:
         warnings.append(f"the rolling shutter of {rolling} photographs is not modelled.")
+    warnings += survey_note(_num_control_points(items), "control points", "")
     unknown = ""
     try:
         system, place, is_metric = _system(items)
@@ -100,6 +102,13 @@ def read(file: Path, options: CaptureOptions) -> Project:
         is_metric=is_metric, place=place, warnings=tuple(warnings), refused=refused,
         unknown_system=unknown, remedy="Export COLMAP from PIX4Dmatic, or undistort the photographs",
     )  # fmt: skip
+
+
+def _num_control_points(items: _Items) -> int:
+    """How many control points a project brings (input-control-points)."""
+    content = items.document("input-control-points") or {}
+    found = content.get("gcps")  # its mtps are marked, not surveyed
+    return len(found) if isinstance(found, list) else 0
 
 
 def _rolls(shutter: Any) -> bool:
