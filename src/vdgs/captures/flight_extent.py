@@ -25,8 +25,8 @@ _STEP_TO_COMPARE_M, _STEP_PER_HEIGHT, _LOWEST_GROUND_M = 3_000.0, 3.0, 500.0
 NO_LAND_DEG, _SPREAD_AT_SEA_M = 4.0, 2_000.0
 #: No scene is wider (metres): power lines of 200 km are (choice).
 WIDEST_M = 500_000.0
-#: No camera is farther from the ground, in metres: manned aircraft are at 10 to 20 km (choice).
-HIGHEST_OVER_GROUND_M = 50_000.0
+#: No camera is farther from the ground, in metres: aircraft are at 10 to 20 km, balloons at 35 km (choice).
+HIGHEST_OVER_GROUND_M = 40_000.0
 _MIN_PLACES = 3
 
 
