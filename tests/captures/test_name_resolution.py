@@ -33,11 +33,13 @@ def apart(name: str) -> str:
 
 
 def matched(tmp_path: Path, names: list[str], *rows: str) -> dict[str, float]:
-    """Latitudes that a table of rows `name` and `latitude` gives photographs."""
-    file = tmp_path / "gps.csv"
-    file.write_text("name,lat,lon,alt\n" + "".join(f"{row},20,5\n" for row in rows), encoding="utf-8")
+    """The numbers that a table gives photographs, of rows `name` and `number`: its latitudes are ten metres apart."""
+    file, parted = tmp_path / "gps.csv", [row.rpartition(",") for row in rows]
+    lines = [f"{name},{40 + 1e-4 * int(number):.4f},20,5\n" for name, _, number in parted]
+    file.write_text("name,lat,lon,alt\n" + "".join(lines), encoding="utf-8")
     found = match_gps(names, file)
-    return {names[index]: float(place[0]) for index, place in zip(found.images, found.geodetic, strict=True)}
+    latitudes = found.geodetic[:, 0]
+    return {names[index]: round((place - 40) * 1e4) for index, place in zip(found.images, latitudes, strict=True)}
 
 
 def card(folder: Path, *names: str) -> Path:
@@ -101,12 +103,12 @@ def test_blanks_and_accents_are_alike_in_tables_and_photographs(tmp_path):
     names = [photo.name for photo in collect_images([folder]).images]
     assert names == ["höhe__0.jpg", "x_1.jpg", "é/x_1.jpg"]
     table = tmp_path / "gps.csv"
-    rows = ["Höhe  0.jpg,1", "x 1.jpg,1.1", "É/x 1.jpg,1.2"]
+    rows = ["Höhe  0.jpg,1", "x 1.jpg,1.001", "É/x 1.jpg,1.002"]
     for way in (lambda text: text, apart):
         table.write_text(way("name,lat,lon,alt\n" + "".join(f"{row},20,5\n" for row in rows)), encoding="utf-8")
         found = read_gps_priors(collect_images([folder]).images, table, (1, 2))
         assert found.image_indices.tolist() == [0, 1, 2]
-        assert np.diff(found.enu[:, 1]) == pytest.approx([11e3, 11e3], rel=0.02)
+        assert np.diff(found.enu[:, 1]) == pytest.approx([110, 110], rel=0.02)
 
 
 @given(st.lists(st.text("ab é\u0301.", min_size=1, max_size=4), min_size=1, max_size=3))

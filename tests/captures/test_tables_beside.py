@@ -86,6 +86,13 @@ def test_only_positions_are_told_to_lack_a_system(tmp_path, head, row, is_told):
     assert [("coordinate system" in each) for each in said] == ([True] if is_told else [])
 
 
+def test_poses_above_the_folder_of_photographs_are_named_as_poses(tmp_path):
+    text = "TimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile\n1\t2\t3\t-4\t1\t0\t0\t0\t{0}\n"
+    (told,) = planned(tmp_path, "airsim_rec.txt", text, placed=True)[1]
+    assert f"{tmp_path / 'airsim_rec.txt'}: holds poses of AirSim, in metres north, east and down" in told
+    assert "To use it" not in told
+
+
 @pytest.mark.parametrize("name", ["card/geo.txt", "geo.txt"])
 def test_the_table_of_odm_is_used_where_photographs_say_no_positions(tmp_path, name):
     priors, (said,) = planned(tmp_path, name, TABLES[name], placed=False)

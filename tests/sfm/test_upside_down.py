@@ -15,9 +15,9 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm import georegistration
 from vdgs.sfm.attitude_tilt import are_turned_over
-from vdgs.sfm.georeferencing import _refuse_upside_down
+from vdgs.sfm.georeferencing import _refuse_no_scene, _refuse_upside_down
 from vdgs.sfm.georegistration import Georegistration
-from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.up_direction import model_points, up_of
 
@@ -132,6 +132,30 @@ def test_exchanged_positions_along_a_line_are_refused_though_up_is_in_doubt(pitc
         georegistration.georegister(model, photographs, exchanged)
     anyway = georegistration.georegister(model, photographs, exchanged, anyway=True)
     assert any("used all the same" in note for note in anyway.notes)
+
+
+def test_a_world_larger_than_any_is_refused_whatever_made_it_so():
+    model, _, _ = flight_along_a_line(-90.0)
+    placed = SimpleNamespace(method="positions of 18 photographs")
+    prepared = SimpleNamespace(gps_priors=SimpleNamespace(source="poses.csv"))
+    places = np.array([image.projection_center() for image in model.images.values()])
+    _refuse_no_scene(model, float(places[:, 2].mean()) - 12_000, placed, prepared)
+    with pytest.raises(CaptureError, match=r"18 photographs \(poses.csv\), the cameras would be 77 km over the ground"):
+        _refuse_no_scene(model, float(places[:, 2].mean()) - 77_300, placed, prepared)
+
+
+def test_positions_of_photographs_that_are_of_no_flight_are_not_used():
+    """Local metres that a program wrote into EXIF as degrees."""
+    photographs = [
+        SimpleNamespace(
+            name=f"{k}.jpg", lat_lon=(7.0 * (k % 5) - 14, 7.0 * (k // 5) - 14), altitude=35.0, altitude_type="",
+            relative_altitude=None,
+        )
+        for k in range(25)
+    ]  # fmt: skip
+    priors = read_gps_priors(photographs, None, (3.0, 6.0))
+    assert not priors.usable
+    assert any("cannot be of one flight: they lie" in note for note in priors.notes)
 
 
 @pytest.mark.parametrize(

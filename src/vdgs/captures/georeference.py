@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vdgs.captures.flight_extent import LOCAL_METERS, why_no_flight
 from vdgs.captures.gps_altitudes import with_altitudes, without_zero_altitudes
 from vdgs.captures.gps_tables import GpsRow, check_geodetic, read_gps_table
 from vdgs.captures.name_resolution import NameLookup, ambiguity_message
@@ -145,7 +146,8 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
 
     Names match by their whole path, else by the end of it, else without extension; only where the table's folders are
     not those of the images, by what lies in them. Raises `CaptureError` where a name may be of several images, where
-    several rows place one image differently, and if no name matches: then it is another flight's table.
+    several rows place one image differently, if no name matches: then it is another flight's table; and where the
+    positions cannot be of one flight: then they are no degrees.
     """
     lookup = NameLookup((name, index) for index, name in enumerate(names))
     if numbered:
@@ -156,6 +158,13 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
         raise CaptureError(
             f"{file}: none of its {len(rows)} rows names one of the capture's {len(names)} images "
             f"(for example {names[0]!r}). Give the table of this flight, or leave --gps out."
+        )
+    if why := why_no_flight(np.array([row.position for row in found.values()])):
+        latitude, longitude, _ = next(iter(found.values())).position
+        raise CaptureError(
+            f"{file}: its positions, such as {latitude:.10g}, {longitude:.10g}, are no latitudes and longitudes of one "
+            f"flight: {why}. Are they metres? {LOCAL_METERS}; metres of a projected system need its code as a first "
+            "line of its own, such as EPSG:32633."
         )
     return dict(sorted(found.items()))
 

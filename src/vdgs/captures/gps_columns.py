@@ -13,6 +13,9 @@ import numpy as np
 
 from vdgs.captures.column_headings import Heading, read_heading
 from vdgs.captures.coordinate_systems import is_in_degrees, look_like_degrees, to_geodetic
+from vdgs.captures.flight_extent import LOCAL_METERS, NO_LAND_DEG, why_no_flight
+from vdgs.captures.pose_texts import are_quaternions, has_local_places
+from vdgs.captures.system_names import is_local_system
 from vdgs.captures.table_columns import (
     Row,
     has_time,
@@ -46,6 +49,10 @@ class NoSystem(CaptureError):
     def __init__(self, message: str, names: Sequence[str], *, are_positions: bool) -> None:
         super().__init__(message)
         self.names, self.are_positions = tuple(names), are_positions
+
+
+class HoldsPoses(CaptureError):
+    """A table of the poses of a program, in metres of its own."""
 
 
 class Columns(NamedTuple):
@@ -108,6 +115,9 @@ def _lacks_names(words: Sequence[str], file: Path) -> CaptureError:
 
 def _lacks_headings(rows: Sequence[Row], known: Mapping[str, int], system: str | None, file: Path) -> CaptureError:
     found = ", ".join(sorted(word for word in rows[0].words if word)) or "nothing"
+    is_local = is_local_system(" ".join(rows[0].words)) or has_local_places(rows[0].words)
+    if system is None and is_local:
+        raise CaptureError(f"{file}: holds positions of a local system (found: {found}). {LOCAL_METERS}.")
     marks = "" if system is None else " A list of control points is given as --gcp."
     if system is None and not known and len(rows) > 1 and _has_numbers(rows[1]):
         marks = " If it is to name a coordinate system, write its code, such as EPSG:32633."
@@ -152,7 +162,7 @@ def _with_plane(columns: Columns, rows: Sequence[Row], system: str | None, file:
         raise NoSystem(
             f"{file}: has the columns {x!r} and {y!r} but does not "
             "say of which coordinate system. Write its code as a first line of its own, such as EPSG:32633, or "
-            "give name,lat,lon,alt.",
+            f"give name,lat,lon,alt.{_local_remedy(_places_in(body, known['x'], known['y']))}",
             [row.words[known["name"]] for row in body if len(row.words) > known["name"]],
             are_positions="alt" in known or {read_heading(word).stem for word in (x, y)}.isdisjoint({"x", "y"}),
         )
@@ -178,12 +188,14 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
         order |= {"across": 7, "upwards": 8}
     if system is not None:
         return Columns({**order, "x": 1, "y": 2}, system)
-    places = [[number_of(word) for word in row.words[1:3]] for row in rows if len(row.words) > 2]
-    largest = np.abs(np.array(places, float).reshape(-1, 2)).max(axis=0, initial=0)
+    places = _places_in(rows, 1, 2)
+    if _have_quaternions(rows) and not _are_on_land(places):
+        raise HoldsPoses(f"{file}: holds poses: positions and quaternions without names of columns. {LOCAL_METERS}.")
+    largest = np.abs(places).max(axis=0, initial=0)
     if max(largest) > 180:
         raise NoSystem(
             f"{file}: names neither its columns nor the coordinate system of values such as {words[1]}, "
-            f"{words[2]}. Write its code as a first line of its own, such as EPSG:32633.",
+            f"{words[2]}. Write its code as a first line of its own, such as EPSG:32633.{_local_remedy(places)}",
             [row.words[0] for row in rows],
             are_positions=_are_places(rows),
         )
@@ -193,6 +205,33 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
     more = ", ..., accuracies across and up" if "across" in order else ""
     note = "" if swapped and not more else f"names no columns; read as {read}{more}."
     return Columns({**order, **where}, None, note=note)
+
+
+def _places_in(rows: Sequence[Row], x: int, y: int) -> np.ndarray:
+    """The numbers [n, 2] in two columns, NaN for words that are none."""
+    words = [(row.words[x], row.words[y]) for row in rows if len(row.words) > max(x, y)]
+    return np.array([list(map(number_of, pair)) for pair in words], float).reshape(-1, 2)
+
+
+def _local_remedy(places: np.ndarray) -> str:
+    """What to say of coordinates [n, 2] that are too small for a projected system; empty for others."""
+    known = places[np.isfinite(places).all(axis=1)]
+    is_local = len(known) > 0 and np.abs(known).max() < _PROJECTED_FROM
+    return f" {LOCAL_METERS}." if is_local else ""
+
+
+def _are_on_land(places: np.ndarray) -> bool:
+    """Whether numbers [n, 2] may be degrees of one flight, and not about 0, 0."""
+    level = np.column_stack([places, np.full(len(places), np.nan)])
+    middle = np.median(places, axis=0) if len(places) else np.zeros(2)
+    return not why_no_flight(level) and bool((np.abs(middle) >= NO_LAND_DEG).any())
+
+
+def _have_quaternions(rows: Sequence[Row]) -> bool:
+    """Whether rows of no headings hold x, y, z and a quaternion that turns. One that never turns may be codes: of a
+    receiver's solution, of angles that nobody knew."""
+    turns = np.array([[number_of(word) for word in row.words[4:8]] for row in rows if len(row.words) > 7], float)
+    return len(turns) == len(rows) > 2 and are_quaternions(turns) and bool((np.ptp(turns, axis=0) > 0).any())
 
 
 def _are_places(rows: Sequence[Row]) -> bool:

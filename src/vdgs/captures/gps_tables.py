@@ -25,7 +25,8 @@ from vdgs.captures.coordinate_systems import (
     outside_area,
     to_geodetic,
 )
-from vdgs.captures.gps_columns import BY_TIME, DEVIATIONS, Columns, read_columns
+from vdgs.captures.flight_extent import LOCAL_METERS
+from vdgs.captures.gps_columns import BY_TIME, DEVIATIONS, Columns, HoldsPoses, read_columns
 from vdgs.captures.system_names import join_definition, names_a_system
 from vdgs.captures.table_columns import (
     NO_DATA,
@@ -53,6 +54,8 @@ _OTHERS = (
         "is JSON. Export a table instead: `exiftool -csv -n -GPS* PHOTOGRAPHS`, or ODM's geo.txt.",
     ),
 )
+#: The headings of AirSim's record.
+_AIRSIM = re.compile(r"\bpos_x[\s,;]+pos_y[\s,;]+pos_z\b")
 #: Words of exiftool behind altitudes below the sea, and EXIF's numbers (3 below, over the sea and not the ellipsoid).
 _BELOW = re.compile(r"below|negative|^[13]$", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)")
@@ -63,6 +66,8 @@ _O = re.compile(r"\bO\b|(?<=[\d'\"″′°])O$|^O(?=\d)", re.IGNORECASE)
 _NMEA = re.compile(r"\d{4,5}\.\d+")
 #: DJI's list of moments (.MRK): one line for each photograph, by its number.
 _MRK = re.compile(r"([-\d.]+),Lat\s+([-\d.]+),Lon\s+([-\d.]+),Ellh")
+#: Coordinates of local systems are smaller, in metres, and those of projected ones larger (choice).
+_LARGEST_LOCAL = 20_000.0
 #: What columns say that have no heading.
 _NO_HEADING = Heading("", "", (), ())
 
@@ -144,6 +149,10 @@ def _refuse_others(lines: Sequence[Line], file: Path) -> None:
     for begins, what in _OTHERS:
         if re.search(begins, head, re.MULTILINE):
             raise CaptureError(f"{file}: {what}")
+    if _AIRSIM.search(head):
+        raise HoldsPoses(
+            f"{file}: holds poses of AirSim, in metres north, east and down: z points down. {LOCAL_METERS}."
+        )
 
 
 def _system_and_body(lines: Sequence[Line]) -> tuple[str | None, list[Line]]:
@@ -248,9 +257,11 @@ def _other_degrees(latitude: float, longitude: float) -> str:
     """A question about how numbers that are no degrees may be meant."""
     if abs(latitude) > 1e6 and abs(latitude) <= 9e8 and abs(longitude) <= 1.8e9:
         return " Are they degrees times 10,000,000, as in logs of autopilots? Divide them."
+    asked = ""
     if 90 < abs(latitude) < 9000 and abs(longitude) < 18000 and max(abs(latitude) % 100, abs(longitude) % 100) < 60:
-        return " Are they degrees and minutes in one number (ddmm.mmmm, as in NMEA)? Write N or S, E or W behind them."
-    return ""
+        asked = " Are they degrees and minutes in one number (ddmm.mmmm, as in NMEA)? Write N or S, E or W behind them."
+    is_local = max(abs(latitude), abs(longitude)) < _LARGEST_LOCAL
+    return f"{asked} Are they metres? {LOCAL_METERS}." if is_local else asked
 
 
 def _angle(row: Row, columns: Columns, axis: _Axis, file: Path) -> float | None:

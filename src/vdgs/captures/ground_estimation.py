@@ -25,6 +25,7 @@ import numpy as np
 
 from vdgs.captures.camera_height import view_distance
 from vdgs.captures.capture_order import natural_key
+from vdgs.captures.flight_extent import LOCAL_METERS, why_no_scene
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
 from vdgs.captures.georeference import Georef, match_gps, read_georef
 from vdgs.captures.gps_altitudes import refuse_unit, wrong_unit
@@ -301,6 +302,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         method=f"{method} ({file.name})",
     )
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
+    if why := why_no_scene(frame.to_ground(scene.centers), 0.0):
+        raise CaptureError(f"{file}: placed by it, {why}. Mend the table, or leave --gps out. {LOCAL_METERS}.")
     if not has_altitudes and frame.origin_geo is not None:
         frame = replace(frame, origin_geo=(*frame.origin_geo[:2], 0.0))
     _compare_up(scene, frame, warnings)

@@ -23,7 +23,9 @@ from vdgs.captures.pose_texts import (
     is_dtu,
     is_kitti,
     is_kitti_360,
+    is_matrices,
     is_quaternion_table,
+    is_trajectory,
     is_tum,
 )
 from vdgs.captures.project_formats import PROJECTS, find_projects
@@ -94,6 +96,11 @@ _OTHERS = {
     "poses_ts.json": f"poses of OMMO; {_WRITE}",
     "*.ori": f"orientations of PATB; {_AS_OTHERS}",
     "itera.dat": f"orientations of BINGO; {_AS_OTHERS}",
+    "airsim_rec.txt": f"poses of AirSim in metres north, east and down (z points down); {_WRITE}",
+    "tstamps.npy": (
+        "poses of DROID-SLAM; the photographs or the film that it was given are read without them: vdgs sfm "
+        "PHOTOGRAPHS --output CAPTURE"
+    ),
     "database.db": "features of COLMAP; `colmap mapper` makes a model of them",
 }
 _ALIGN = "it is read once its photographs are aligned and it is exported again"
@@ -110,6 +117,7 @@ _BY_CONTENT = (
         "poses of BungeeNeRF; the photographs are read without them: vdgs sfm images --output CAPTURE",
     ),
     (".json", rb'"t_00"\s*:', _POLYCAM),
+    (".json", rb'"cameraviewtransform"', f"cameras of Isaac Sim (Replicator); {_WRITE}"),
     (".json", rb'"cameraposearframe"', f"poses of 3D Scanner App (ARKit); {_WRITE}"),
     (
         ".json", rb'"transform_matrix"',
@@ -163,6 +171,8 @@ _BY_NUMBERS: tuple[tuple[frozenset[str], Callable[[str, str], bool], str], ...] 
     (frozenset({".txt"}), is_kitti, f"poses of KITTI; {_WRITE}"),
     (frozenset({".txt"}), is_kitti_360, f"poses of KITTI-360; {_WRITE}"),
     (frozenset({".txt"}), is_tum, f"poses like those of TUM RGB-D; {_WRITE}"),
+    (frozenset({".txt", ".csv"}), is_trajectory, f"a trajectory of positions and quaternions (VINS, OKVIS); {_WRITE}"),
+    (frozenset({".txt"}), is_matrices, f"poses of Replica (NICE-SLAM), a matrix in each row; {_WRITE}"),
     (frozenset({".txt"}), is_dtu, f"a projection matrix of a photograph (DTU); {_WRITE}"),
     (
         frozenset({".out"}),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -27,6 +27,8 @@ _DTU = re.compile(r"(^|/)cal[^/]*/pos_\d+\.txt$", re.IGNORECASE)
 _PLACES = (*((f"{start}x", f"{start}y") for start in ("t", "p", "pos", "position")), ("x0", "y0"), ("xc", "yc"))
 #: No table of poses has more columns (choice).
 _MOST_COLUMNS = 100
+#: A moment, a position, a quaternion, speeds and biases (choice).
+_MOST_TRAJECTORY_COLUMNS = 20
 
 
 def is_kitti(path: str, text: str) -> bool:
@@ -44,14 +46,42 @@ def is_kitti_360(path: str, text: str) -> bool:
 
 
 def is_tum(path: str, text: str) -> bool:
-    """Rows of a moment, a position and a quaternion. Logs of receivers end in three small deviations and the quality
+    """Rows of a moment, a position and a quaternion."""
+    return _is_trajectory(np.array(_rows(text, 8)).reshape(-1, 8))
+
+
+def is_trajectory(path: str, text: str) -> bool:
+    """The same with commas, and perhaps speeds behind (VINS)."""
+    lines = [line.strip(" ,;\r").split(",") for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    rows = np.array([[number_of(word) for word in line] for line in lines if len(line) == len(lines[0])], float)
+    is_whole = len(rows) == len(lines) > 0 and 8 <= rows.shape[1] <= _MOST_TRAJECTORY_COLUMNS
+    return is_whole and bool(np.isfinite(rows).all()) and _is_trajectory(rows)
+
+
+def _is_trajectory(rows: np.ndarray) -> bool:
+    """Whether rows [n, 8 or more] are of one moment after the other, and have a quaternion behind a position."""
+    return len(rows) >= _MIN_ROWS and bool((np.diff(rows[:, 0]) > 0).all()) and are_quaternions(rows[:, 4:8])
+
+
+def are_quaternions(turns: np.ndarray) -> bool:
+    """Whether rows [n, 4] of numbers are quaternions. Logs of receivers end in three small deviations and the quality
     of the solution, 1: of a quaternion with 1 the others are 0."""
-    rows = np.array(_rows(text, 8)).reshape(-1, 8)
-    turns = rows[:, 4:]
-    if len(rows) < _MIN_ROWS or not (np.diff(rows[:, 0]) > 0).all():
+    if not np.isfinite(turns).all():
         return False
     is_quality = (np.abs(turns).max(axis=1) == 1) & (np.count_nonzero(turns, axis=1) > 1)
     return bool((np.abs(np.linalg.norm(turns, axis=1) - 1) < _TOLERANCE).all() and not is_quality.all())
+
+
+def has_local_places(headings: Sequence[str]) -> bool:
+    """Whether headings are those of positions in the own system of a program (tx, pos_x)."""
+    plain = {read_heading(word).plain for word in headings}
+    return any({*pair} <= plain for pair in _PLACES)
+
+
+def is_matrices(path: str, text: str) -> bool:
+    """Rows of a matrix of 4 x 4, world from camera; one alone may be of one photograph."""
+    rows = np.array(_rows(text, 16)).reshape(-1, 4, 4)
+    return len(rows) > 1 and bool((rows[:, 3] == [0, 0, 0, 1]).all()) and all(_is_rotation(row[:3, :3]) for row in rows)
 
 
 def is_dtu(path: str, text: str) -> bool:

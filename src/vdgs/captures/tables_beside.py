@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vdgs.captures.georeference import match_rows
-from vdgs.captures.gps_columns import NoSystem
+from vdgs.captures.gps_columns import HoldsPoses, NoSystem
 from vdgs.captures.gps_tables import BY_TIME, GpsRow, read_gps_table
 from vdgs.captures.text_tables import read_lines
 from vdgs.errors import CaptureError
@@ -35,13 +35,15 @@ class TableBeside(NamedTuple):
     photographs: int
     problem: str = ""
     """Why one of photographs that are there, or ODM's own, cannot be used."""
+    holds_poses: bool = False
+    """Whether it holds poses of another program instead."""
 
 
 def position_tables(
     folders: Iterable[Path], names: Sequence[str], *, without_system: bool = False
 ) -> list[TableBeside]:
     """Tables in the folders that hold positions of the photographs of these names; those of most photographs first, and
-    where asked those that do not say of which coordinate system they are."""
+    where asked those that do not say of which coordinate system they are, and poses."""
     found = []
     for file in _candidates(folders):
         try:
@@ -52,6 +54,8 @@ def position_tables(
             is_told = without_system and error.are_positions and _count(names, rows, file) >= _MIN_ROWS
             if is_told or file.name.lower() == ODM_POSITIONS:
                 found.append(TableBeside(file, 0, str(error)))
+        except HoldsPoses as error:
+            found += [TableBeside(file, 0, str(error), holds_poses=True)] if without_system else []
         except CaptureError as error:  # mostly some other text
             found += [TableBeside(file, 0, str(error))] if file.name.lower() == ODM_POSITIONS else []
     return sorted(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vdgs.captures.flight_extent import LOCAL_METERS, why_no_scene
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import Up
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
@@ -90,6 +91,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
             model, control, prepared.origin, doubtful, _knows_altitude(prepared, placed)
         )
     ground = float(np.median(model_points(model)[:, 2]))
+    _refuse_no_scene(model, ground, placed, prepared)
     _refuse_upside_down(model, ground, placed, prepared)
     georegistration.transform_model(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
     latitude, longitude, altitude = prepared.origin
@@ -361,6 +363,18 @@ class Doubts:
 
 def _distance(meters: float) -> str:
     return f"{meters / 1000:.3g} km" if meters >= 1000 else f"{meters:.3g} m"
+
+
+def _refuse_no_scene(
+    model: pycolmap.Reconstruction, ground: float, placed: Georegistration, prepared: ReconstructionPlan
+) -> None:
+    """Raise CaptureError for a placed world that is larger than any, whatever made it so."""
+    centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+    if why := why_no_scene(centers, ground):
+        raise CaptureError(
+            f"placed by {placed.method} ({prepared.gps_priors.source}), {why}. Are metres or feet read as degrees or "
+            "kilometres? Mend them, or say --georeference off (without positions). " + LOCAL_METERS + "."
+        )
 
 
 def _refuse_upside_down(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vdgs.captures.flight_extent import why_no_flight
 from vdgs.captures.georeference import match_rows
 from vdgs.captures.gps_altitudes import refuse_unit, with_altitudes, without_zero_altitudes, wrong_unit
 from vdgs.captures.gps_tables import GpsRow, read_gps_table
@@ -111,7 +112,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     recorded = _read_geodetic(photographs, table)
     geodetic, notes = recorded.geodetic, recorded.notes
     names = [photo.name for photo in photographs]
-    known = _of_one_place(geodetic, names, notes)
+    known = _of_one_flight(geodetic, notes) & _of_one_place(geodetic, names, notes)
     geodetic, kept, has_altitudes = _in_space_or_plane(geodetic, known, names, notes)
     index = np.flatnonzero(kept)
     origin = _origin(geodetic[index])
@@ -150,6 +151,14 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         altitude_step_m=step,
         datum_errors_m=np.array([photo.datum_error_m if table is None else recorded.datum_error_m for photo in taken]),
     )
+
+
+def _of_one_flight(geodetic: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Which of the positions [n, 3] may be of one flight, [n] bool: all or none; a note says why none."""
+    why = why_no_flight(geodetic)
+    if why:
+        notes.append(f"the positions cannot be of one flight: {why}; not used. Are they metres, where degrees belong?")
+    return np.full(len(geodetic), not why)
 
 
 def _of_one_place(geodetic: np.ndarray, names: Sequence[str], notes: list[str]) -> np.ndarray:

@@ -105,6 +105,8 @@ def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[Sfm
             f"{number} and is used. To leave it out: --georeference off"
         )
         return replace(request, gps=used.file), notes
+    read = [folder.resolve() for folder in collection.folders]  # where poses of other programs are named already
+    tables = [each for each in tables if not each.holds_poses or not {*read} & {*each.file.resolve().parents}]
     notes += [table_note(table, number) for table in tables]
     return request, notes if tables or placed >= MIN_POSITIONS else [*notes, *track_notes(folders)]
 
