@@ -282,8 +282,8 @@ def test_a_long_line_is_not_doubted_for_what_up_may_be_off_by():
 
 
 def strip(seed: int, sag_m: float = 2.5, noise_m: float = 0.5) -> tuple[np.ndarray, Problem]:
-    """One strip of 300 m at one height, which a wrong focal length bent, below views that may be of a wall; and where it
-    was flown."""
+    """Where one strip of 300 m was flown at one height, and it as a wrong focal length bent it; its views may be of a
+    wall."""
     rng, x = np.random.default_rng(seed), np.linspace(-150, 150, 24)
     places = np.stack([x, 0.3 * np.sin(x), 46 + 0.3 * np.cos(3 * x)], axis=1)
     bent = places + np.outer(sag_m * ((x / 150) ** 2 - 0.33), [0, 0, 1])

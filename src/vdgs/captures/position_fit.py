@@ -92,8 +92,8 @@ def _level_as_known(drifting: PositionFit, plane: PositionFit) -> PositionFit:
 
 
 def _says_less_than_views(fit: PositionFit, problem: Problem) -> bool:
-    """Whether altitudes tell up less well than it is known without positions. Across one line no altitudes tell it: there those
-    that do not drift say what they can along it."""
+    """Whether altitudes tell up less well than it is known without positions. Across one line no altitudes tell it:
+    there those that do not drift say what they can along it."""
     weights = fit.gps_std[2] / fit.deviations[fit.inliers, 2:]
     places = fit.placed[fit.inliers, :2]
     middle = (places * weights**2).sum(axis=0) / (weights**2).sum()
