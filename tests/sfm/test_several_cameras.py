@@ -103,13 +103,15 @@ def test_only_positions_without_an_altitude_are_named_as_such(tmp_path):
 def test_overlap_and_pixels_are_those_of_the_wide_lens_where_a_zoom_flies_beside_it(tmp_path):
     """An H20T's `_W` and `_Z`: of the zoom, three times as long, photographs hardly overlap."""
     for k in range(8):
-        for letter in "WZ":
-            write_photograph(tmp_path / f"DJI_{k:04d}_{letter}.JPG", pixels(k), 3 * k, np.array([8.0 * k, 0, 40]))
+        for n, letter in enumerate("WZ"):
+            shown = pixels(10 * k + n)
+            write_photograph(tmp_path / f"DJI_{k:04d}_{letter}.JPG", shown, 3 * k, np.array([8.0 * k, 0, 40]))
     found = collect_images([tmp_path])
     images = [
         replace(photo, lens=replace(photo.lens, focal=(1 if photo.name.endswith("W.JPG") else 3) * photo.lens.focal))
         for photo in found.images
     ]
+    assert len(images) == 16
     both = replace(found, images=tuple(images))
     alone = replace(found, images=tuple(photo for photo in images if photo.name.endswith("W.JPG")))
     one, other = (make_preflight_report(each, read_gps_priors(each.images, None, (1.0, 2.0))) for each in (both, alone))
