@@ -103,12 +103,13 @@ def find_sky_mask(
     alike = (np.abs(apart).max(axis=2) <= MAX_DIFFERENCE) & (up > math.sin(PLAIN_ELEVATION))
     alike &= ~_shows_points(points, camera)
     count, parts = cv2.connectedComponents((alike & smooth).astype(np.uint8), connectivity=4)
-    sizes = np.bincount(parts.ravel(), minlength=count)
-    grown = np.isin(parts, np.setdiff1d(parts[above & smooth], [0]))
+    grows = np.bincount(parts[above & smooth], minlength=count) > 0
+    opens = np.bincount(parts[up > 0], minlength=count) > 0
     # What shows below a bridge or through a frame.
-    apertures = np.flatnonzero(sizes >= MIN_APERTURE * parts.size)
-    aperture = np.isin(parts, np.intersect1d(parts[up > 0], apertures[apertures > 0]))
-    border = cv2.dilate((grown | aperture).astype(np.uint8), np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)) > 0
+    opens &= np.bincount(parts.ravel(), minlength=count) >= MIN_APERTURE * parts.size
+    grows[0] = opens[0] = False
+    grown = grows[parts]
+    border = cv2.dilate((grows | opens)[parts].astype(np.uint8), np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)) > 0
     sky = above | (border & alike)
     return SkyMask.of(camera, sky, grown & (up > math.sin(LOWEST_ELEVATION))) if sky.any() else None
 
