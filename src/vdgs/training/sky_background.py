@@ -1,4 +1,4 @@
-"""What a training step shows behind the anchors where a photograph looks above the scene: the environment map.
+"""What a training step shows behind the anchors where a photograph shows sky: the environment map.
 
 Elsewhere a random color stays, so that ground cannot borrow its color from the map. The map is composed with the
 picture outside the rasterizer: a pixel is C + T (sky - b) + T b with the plain background b and transmittance T. Where
@@ -83,7 +83,8 @@ def with_sky(
     """The view with the environment map of the decoder, where it has one and the view shows sky. Going backward leaves
     in the `.grad` of the map how the loss changes with each of its cells: the mean over the pixels that count and show
     the cell, in the loss of one pixel. Cells that show for less than a pixel count as if it were one: Adam would move
-    them as fast as the others, away from what no pixel holds."""
+    them as fast as the others, away from what no pixel holds. In pixels of empty sky the mean of alpha is a loss, of
+    which the gradient is left too, but which the loss of the step does not show."""
     envmap, sky_mask = decoder.envmap, None if stage.sky_masks is None else stage.sky_masks[view]
     if envmap is None or sky_mask is None:
         return drawn

@@ -1,4 +1,4 @@
-"""Which pixels of the photographs show sky, along the outlines of what stands before it.
+"""Which pixels of photographs show sky, along the outlines of what stands before it.
 
 A skyline is coarse: a mast lifts it over a sector of azimuth, with the sky beside the mast. Here the sky above the
 skyline grows down into what is smooth and has its color.
@@ -32,13 +32,11 @@ BORDER_PX = 3
 POINT_PX, CLUSTER_PX = 2, 6
 #: Sky apart from the sky above the skyline fills at least such a share of the photograph (choice).
 MIN_APERTURE = 0.001
-#: An anchor hangs in the sky if it does in so many photographs, and in such a share of those that hold it (choice).
-MIN_VIEWS, MIN_SHARE = 2, 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class SkyMask:
-    """The sky of a photograph, as packed bits in rows: a mask of 1000 photographs takes what one photograph does."""
+    """The sky of a photograph, as packed bits in rows: two bits a pixel."""
 
     #: Of the whole photograph, in the size of the mask.
     camera: Camera
@@ -137,20 +135,3 @@ def _shows_points(points: Float[np.ndarray, "n 3"], camera: Camera) -> Bool[np.n
     many = cv2.boxFilter(shown, -1, (2 * CLUSTER_PX + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
     near = ((shown > 0) & (many > MIN_POINTS - 0.5)).astype(np.uint8)
     return cv2.dilate(near, np.ones((2 * POINT_PX + 1,) * 2, np.uint8)) > 0
-
-
-def hangs_in_sky(
-    places: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], masks: Sequence[SkyMask | None]
-) -> Bool[np.ndarray, " n"]:
-    """Which places show before sky alone in some of the photographs that hold them: nothing solid is there."""
-    held, empty = np.zeros(len(places), np.int64), np.zeros(len(places), np.int64)
-    for camera, mask in zip(cameras, masks, strict=True):
-        if mask is None:
-            held += camera.in_frustum(places)
-            continue
-        at, depth = mask.camera.project(places)
-        inside = np.flatnonzero(mask.camera.holds(at, depth))
-        columns, rows = np.floor(at[inside]).astype(int).T
-        held[inside] += 1
-        empty[inside] += mask.empty_at(mask.camera).numpy()[rows, columns]
-    return (empty >= MIN_VIEWS) & (empty >= MIN_SHARE * held)
