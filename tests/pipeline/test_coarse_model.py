@@ -120,6 +120,6 @@ def test_photographs_that_look_down_have_an_environment_map_only_if_asked_for(tm
         with open_training_images(capture, config, 10**7) as images:
             stage, anchors = build_coarse_problem(capture, config, images, "cpu")
             state = initial_coarse_state(anchors, stage, False)
-        assert (state.decoder.envmap is None) == (stage.skylines is None) == (choice != "envmap")
+        assert (state.decoder.envmap is None) == (stage.sky_masks is None) == (choice != "envmap")
     plain = torch.tensor(stage.background).expand_as(state.decoder.envmap)
     torch.testing.assert_close(state.decoder.envmap.detach(), plain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,11 +18,12 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import TrainingSplats
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.envmap import ray_angles, ray_directions, row_elevations, sample_envmap
-from vdgs.model.initialization.sky import above_skyline, find_skyline, find_skylines, in_sky, initial_envmap
+from vdgs.model.initialization.sky import above_skyline, find_skyline, find_skylines, in_sky, initial_envmap, sky_above
+from vdgs.model.initialization.sky_masks import SkyMask
 from vdgs.model.renderer import render
 from vdgs.partition.merging import merge_blocks
 from vdgs.training import TrainingState, from_checkpoint, initial_state, to_checkpoint
-from vdgs.training.sky_background import with_sky
+from vdgs.training.sky_background import EMPTY_WEIGHT, with_sky
 from vdgs.training.target import TrainingTarget
 from vdgs.training.training_step import RenderedTrainingView, compute_loss, render_for_training
 
@@ -126,7 +128,8 @@ def test_the_first_map_is_what_the_photographs_show() -> None:
     cameras = [level_camera(yaw) for yaw in range(0, 360, 40)]
     skylines, _ = find_skylines(lambda: TOWN, cameras)
     read = lambda index: ((dome(ray_directions(cameras[index])) * 255).byte(), None, cameras[index])  # noqa: E731
-    envmap = initial_envmap(read, skylines, cameras, (0.9, 0.1, 0.9))
+    above = [partial(sky_above, skyline) for skyline in skylines]
+    envmap = initial_envmap(read, above, cameras, (0.9, 0.1, 0.9))
     for yaw in (20.0, 100.0, 200.0):  # between the photographs
         directions = ray_directions(level_camera(yaw))
         clear = ray_angles(directions)[1] > 0.03
@@ -144,10 +147,13 @@ def _target(camera: Camera, mask: torch.Tensor | None = None) -> TrainingTarget:
     return TrainingTarget(image=white, mask=mask, camera=camera, counted_pixels=counted)
 
 
-def _drawn(envmap: torch.Tensor, opacity: float, mask: torch.Tensor | None = None) -> RenderedTrainingView:
+def _drawn(
+    envmap: torch.Tensor, opacity: float, mask: torch.Tensor | None = None, empty: bool = False
+) -> RenderedTrainingView:
     """A splat larger than the picture before the map, in a step."""
     state, camera = start(TrainConfig(iterations=1)), level_camera(0.0)
-    stage = replace(small_stage(), skylines=(find_skyline(camera.position, TOWN),))
+    sky = sky_above(find_skyline(camera.position, TOWN), camera).numpy()
+    stage = replace(small_stage(), sky_masks=(SkyMask.of(camera, sky, sky & empty),))
     decoder = replace(state.decoder, envmap=envmap)
     splats = TrainingSplats(
         means_px=torch.tensor([[30.0, 8.0]]), conics=torch.tensor([[1e-5, 0.0, 1e-5]]), depths=torch.ones(1),
@@ -179,6 +185,27 @@ def test_gradients_are_finite_differences() -> None:
     # What lies below the skyline does not show the map.
     assert torch.equal(drawn.image[-1], _drawn(1 - envmap.detach(), 0.4).image[-1])
     assert not torch.equal(drawn.image[0], _drawn(1 - envmap.detach(), 0.4).image[0])
+
+
+def test_what_hangs_in_empty_sky_fades_whatever_its_color() -> None:
+    """A splat that looks as the sky behind it does changes no pixel: nothing else would remove it."""
+    camera = level_camera(0.0)
+    decoder, config = start(TrainConfig(iterations=1)).decoder, TrainConfig()
+    config = replace(config, loss=replace(config.loss, ssim_lambda=0.0))
+    top = torch.zeros(48, 64, dtype=torch.uint8)
+    top[:10] = 1
+    seen = top.bool()
+
+    def by_opacity(empty: bool, mask: torch.Tensor = top) -> float:
+        drawn = _drawn(torch.full((16, 64, 3), 0.3), 0.4, mask, empty)
+        drawn = replace(drawn, image=torch.ones_like(drawn.image))  # as the photograph is
+        gradient = compute_loss(drawn, _target(camera, mask), decoder, 0, config).image
+        return float(drawn.backward(gradient, 0.0).opacities)
+
+    assert by_opacity(False) == 0
+    spread = float(_drawn(torch.full((16, 64, 3), 0.3), 0.4).raster.alpha[seen].mean()) / 0.4
+    assert by_opacity(True) == pytest.approx(EMPTY_WEIGHT * spread, rel=1e-3)
+    assert by_opacity(True, torch.zeros_like(top)) == 0  # what is masked costs nothing
 
 
 def test_a_mask_makes_the_steps_of_the_map_no_larger() -> None:
@@ -215,8 +242,9 @@ def test_blocks_do_not_move_it() -> None:
 
 
 def test_a_training_that_goes_on_moves_it_to_the_same_bits() -> None:
-    everywhere = torch.full((90,), -2.0)
-    stage = replace(small_stage(), skylines=(everywhere, None) * 4)
+    stage, everywhere = small_stage(), np.ones((48, 64), bool)
+    masks = [SkyMask.of(stage.images.camera(view), everywhere, ~everywhere) for view in range(8)]
+    stage = replace(stage, sky_masks=[None if view % 2 else mask for view, mask in enumerate(masks)])
 
     def begin() -> TrainingState:
         state = start()

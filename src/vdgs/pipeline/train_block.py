@@ -26,6 +26,7 @@ from vdgs.distributed.shard import Shard
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
+from vdgs.model.initialization.sky_masks import SkyMask
 from vdgs.model.levels import level_sizes
 from vdgs.model.scale_bounds import max_log_scales
 from vdgs.partition.block_regions import growth_mask, lr_ramp, split_trainable_anchors, visible_anchors
@@ -45,7 +46,7 @@ from vdgs.training.session.trainer import (
     train_with_checkpoints,
     warn_without_densification,
 )
-from vdgs.training.sky_background import view_skylines
+from vdgs.training.sky_background import view_sky_masks, view_skylines
 from vdgs.visibility.visibility_counts import effective_sample_size
 
 
@@ -117,6 +118,13 @@ class BlockPlan:
         factors = tuple(sorted({factor for _, factor in self.config.resolution_schedule}))
         return ImageCache(self.views, budget_bytes, downscales=factors)
 
+    def _sky_masks(self, capture: Capture, images: ImageCache) -> tuple[SkyMask | None, ...] | None:
+        """The sky in the photographs of the block; None where there is no map of it."""
+        if self.coarse.envmap is None:
+            return None
+        skylines, _ = view_skylines(capture, self.views)
+        return view_sky_masks(capture, images, self.config, skylines, self.coarse.envmap, self.coarse.background)
+
     def problem(
         self, capture: Capture, blocks: Blocks, method: MethodConfig, images: ImageCache, device: torch.device
     ) -> TrainingProblem:
@@ -131,7 +139,7 @@ class BlockPlan:
             frozen_anchors=FrozenAnchors(self.surroundings, coarse.decoder),
             growth_mask=growth_mask(blocks, self.index, method.block),
             lr_mask=lr_ramp(blocks, self.index, method.block),
-            skylines=None if coarse.envmap is None else view_skylines(capture, self.views)[0],
+            sky_masks=self._sky_masks(capture, images),
             image_indices=self.indices, view_weights=self.weights, crops=self.crops,
             photograph_pixel=coarse.photograph_pixel,
             max_log_scale=(

@@ -24,7 +24,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import zero_exposures
 from vdgs.model.initialization.initialize import initialize_anchors
-from vdgs.model.initialization.sky import Skyline, initial_envmap
+from vdgs.model.initialization.sky_masks import SkyMask
 from vdgs.model.initialization.stereo import DensePoints
 from vdgs.model.levels import add_coarser_levels, describe_levels, fit_levels
 from vdgs.model.scale_bounds import max_log_scales, photograph_pixel
@@ -48,7 +48,7 @@ from vdgs.training.session.trainer import (
     train_with_checkpoints,
     warn_without_densification,
 )
-from vdgs.training.sky_background import view_skylines
+from vdgs.training.sky_background import photographed_envmap, view_sky_masks, view_skylines
 
 
 def train_coarse(context: RunContext, options: CheckpointOptions, console: Console, device: str = "cpu") -> None:
@@ -107,8 +107,8 @@ def _train(
         )
         if stage.max_pixels:
             console.print(describe_levels(state.anchors), highlight=False)
-        if stage.skylines is not None:
-            shown = sum(skyline is not None for skyline in stage.skylines)
+        if stage.sky_masks is not None:
+            shown = sum(mask is not None for mask in stage.sky_masks)
             console.print(
                 f"sky: {shown} photographs show it or what is far away; an environment map is trained behind the scene",
                 highlight=False,
@@ -225,7 +225,7 @@ def build_coarse_problem(
         offset_rate_factor=offset_rate_factor(capture, config),
         background=background,
         view_weights=view_sampling_weights(config, anchors, cameras),
-        skylines=_skylines(capture, config),
+        sky_masks=_sky_masks(capture, config, images, background),
         device=torch.device(device),
         max_log_scale=(lambda positions: max_log_scales(positions, cameras)) if config.model.bound_scales else None,
         photograph_pixel=photograph_pixel(anchors.positions, cameras) if config.model.photograph_blur else 0.0,
@@ -233,12 +233,16 @@ def build_coarse_problem(
     return stage, add_coarser_levels(anchors, voxel, max_pixels) if max_pixels else anchors
 
 
-def _skylines(capture: Capture, config: TrainConfig) -> tuple[Skyline | None, ...] | None:
+def _sky_masks(
+    capture: Capture, config: TrainConfig, images: ImageCache, background: tuple[float, float, float]
+) -> tuple[SkyMask | None, ...] | None:
     """Those of the training photographs; None where no environment map is trained."""
     if config.model.background_model == "off":
         return None
     skylines, show_sky = view_skylines(capture, capture.train_views)
-    return skylines if show_sky or config.model.background_model == "envmap" else None
+    if not show_sky and config.model.background_model != "envmap":
+        return None
+    return view_sky_masks(capture, images, config, skylines, None, background)
 
 
 def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures: bool) -> TrainingState:
@@ -249,9 +253,7 @@ def initial_coarse_state(anchors: Anchors, stage: TrainingProblem, fit_exposures
     )
     if fit_exposures:
         decoder = replace(decoder, exposure=zero_exposures(stage.num_images))
-    if stage.skylines is not None:
-        factor = max(factor for _, factor in stage.config.resolution_schedule)
-        cameras = [stage.images.camera(index) for index in range(stage.num_images)]
-        read = lambda index: (*stage.images.get(index, factor), stage.images.camera(index, factor))  # noqa: E731
-        decoder = replace(decoder, envmap=initial_envmap(read, stage.skylines, cameras, stage.background))
+    if stage.sky_masks is not None:
+        skies = [None if mask is None else mask.sky_at for mask in stage.sky_masks]
+        decoder = replace(decoder, envmap=photographed_envmap(stage.images, stage.config, skies, stage.background))
     return initial_state(anchors.to(stage.device), decoder.to(stage.device), stage)

@@ -18,6 +18,7 @@ from vdgs.kernels.transfer import DeviceCopies
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import EXPOSURE, OLD_EXPOSURE, Decoder
+from vdgs.model.initialization.sky_masks import SkyMask
 from vdgs.system.checkpoints import Checkpoint
 from vdgs.training.compensation import CompensationState
 from vdgs.training.crops import Crop
@@ -182,8 +183,8 @@ class TrainingProblem:
     crops: tuple[Crop, ...] | None = None
     #: What is added to the loss by a method of several blocks with one decoder; None: nothing.
     guidance: LossGuidance | None = None
-    #: The skyline of each view (`model.initialization.sky`), None for a view without sky; None: no view shows any.
-    skylines: Sequence[Tensor | None] | None = None
+    #: The sky of each view, None for a view without sky; None: no view shows any.
+    sky_masks: Sequence[SkyMask | None] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     #: Of photographs, on that device.

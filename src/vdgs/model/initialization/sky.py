@@ -65,11 +65,17 @@ def above_skyline(directions: Float[Tensor, "*n 3"], skyline: Skyline) -> Bool[T
     return elevation > skyline.to(directions.device)[_sector(azimuth)]
 
 
+def sky_above(skyline: Skyline, camera: Camera) -> Bool[Tensor, "h w"]:
+    """Which pixels of a camera look above a skyline."""
+    return above_skyline(ray_directions(camera), skyline)
+
+
 def find_skylines(
     find_points: Callable[[], Float[np.ndarray, "n 3"]], cameras: Sequence[Camera]
 ) -> tuple[tuple[Skyline | None, ...], bool]:
-    """The skyline of every camera that has a ray above it, None for the others; and whether enough of all rays pass
-    above horizon and skyline for the photographs to show sky. Points are not asked for where all cameras look down."""
+    """The skyline of every camera that has a ray so high that it may show sky, None for the others; and whether enough
+    of all rays pass above horizon and skyline for the photographs to show sky. Points are not asked for where all
+    cameras look down."""
     found, share, points = list[Skyline | None](), 0.0, None
     for camera in cameras:
         directions = ray_directions(camera.resized(_GRID[1], _GRID[0]))
@@ -80,7 +86,7 @@ def find_skylines(
         skyline = find_skyline(camera.position, points)
         above = above_skyline(directions, skyline)
         share += float((above & (directions[..., 2] > 0)).float().mean()) / len(cameras)
-        found.append(skyline if bool(above.any()) else None)
+        found.append(skyline)
     return tuple(found), share >= MIN_SKY_SHARE
 
 
@@ -106,23 +112,24 @@ def in_sky(
 
 def initial_envmap(
     read: Callable[[int], tuple[Tensor, Tensor | None, Camera]],
-    skylines: Sequence[Skyline | None],
+    skies: Sequence[Callable[[Camera], Bool[Tensor, "h w"]] | None],
     cameras: Sequence[Camera],
     background: tuple[float, float, float],
 ) -> Float[Tensor, "rows columns 3"]:
-    """The mean of what photographs show above their skylines, smoothly continued to where none looks; `background`
-    below 30 degrees under the horizon. `read` gives a photograph [h, w, 3] uint8, its mask and its camera."""
+    """The mean of what photographs show in their skies, smoothly continued to where none looks; `background` below 30
+    degrees under the horizon. `read` gives a photograph [h, w, 3] uint8, its mask and its camera; `skies` tell which
+    pixels of a photograph's camera are sky, None: none are."""
     focal = float(np.median([camera.fx for camera in cameras]))
     columns = int(np.clip(round(2 * math.pi * focal / CELL_PX / 64), MIN_COLUMNS // 64, MAX_COLUMNS // 64)) * 64
     rows = columns // 4
     total = np.zeros((rows * columns, 4))
-    shown = [index for index, skyline in enumerate(skylines) if skyline is not None]
+    shown = [index for index, sky in enumerate(skies) if sky is not None]
     for index in (shown[i] for i in np.unique(np.linspace(0, len(shown) - 1, min(len(shown), MAX_IMAGES)).astype(int))):
         image, mask, camera = read(index)
-        skyline = skylines[index]
-        assert skyline is not None
+        find_sky = skies[index]
+        assert find_sky is not None
         directions = ray_directions(camera)
-        above = above_skyline(directions, skyline)
+        above = find_sky(camera)
         if mask is not None:
             above &= mask > 0
         azimuth, elevation = (each[above].double() for each in ray_angles(directions))
