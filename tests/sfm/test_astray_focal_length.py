@@ -13,7 +13,7 @@ pycolmap = pytest.importorskip("pycolmap")
 
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
-from vdgs.sfm import incremental_mapper, reconstruct  # noqa: E402
+from vdgs.sfm import incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
 from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
 from vdgs.sfm.focal_length import Lens  # noqa: E402
@@ -129,11 +129,11 @@ def mapped(
         request=SimpleNamespace(options=SfmOptions(focal=focal)),
     )  # fmt: skip
     monkeypatch.setattr(incremental_mapper, "run_mapper", mapper)
-    monkeypatch.setattr(reconstruct.global_mapper, "leaves_photographs_out", lambda _: False)
+    monkeypatch.setattr(mapping.global_mapper, "leaves_photographs_out", lambda _: False)
     if focal == "auto":
         monkeypatch.setattr(incremental_mapper, "should_fix_focal", lambda *_: FITTED)
     with console.capture() as said:
-        models, held = reconstruct._mapped(plan, workspace, [GROUP], "key", 6, console)
+        models, held = mapping.map_photographs(plan, workspace, [GROUP], "key", 6, console)
     return models[0], held, said.get()
 
 
@@ -177,7 +177,7 @@ def test_fitting_the_focal_length_leaves_the_log_of_colmap_silent(capfd):
     model = model_of(images=4)
     before = model.cameras[1].focal_length
     model.cameras[1].focal_length = 1.05 * before
-    incremental_mapper._fit_focal(model, 1)
+    incremental_mapper.fit_focal(model, 1)
     assert model.cameras[1].focal_length == pytest.approx(before, rel=0.02)
     pycolmap.logging.info("told")
     assert capfd.readouterr() == ("", "")

@@ -15,7 +15,7 @@ pycolmap = pytest.importorskip("pycolmap")
 from vdgs.captures.reconstruction import CameraReport  # noqa: E402
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
-from vdgs.sfm import fisheyes, incremental_mapper, reconstruct  # noqa: E402
+from vdgs.sfm import fisheyes, incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
 from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
 from vdgs.sfm.focal_length import DIAGONAL_35_MM, Lens  # noqa: E402
@@ -139,20 +139,20 @@ def test_models_are_made_anew_with_fisheyes_once(tmp_path, monkeypatch, fails):
     mapper, errors = Mapper(fails), [(0.56, 0.13)]
     photo = SimpleNamespace(name="a", camera_model=RADIAL)
     monkeypatch.setattr(fisheyes, "with_fisheyes", lambda photos, _: [SimpleNamespace(camera_model=FISHEYE)])
-    monkeypatch.setattr(reconstruct, "_models", mapper)
-    monkeypatch.setattr(reconstruct.feature_extraction, "group_by_camera", lambda _: [replace(GOPRO, model=FISHEYE)])
+    monkeypatch.setattr(mapping, "make_models", mapper)
+    monkeypatch.setattr(mapping, "group_by_camera", lambda _: [replace(GOPRO, model=FISHEYE)])
     monkeypatch.setattr(fisheyes, "compare", lambda *_: errors.pop())
     monkeypatch.setattr(fisheyes, "use_lenses", lambda *_: None)
     for name, value in (("should_fix_focal", (False, "")), ("release_focal", (False, "")), ("is_contradicted", False),
                         ("is_astray", False)):  # fmt: skip
         monkeypatch.setattr(incremental_mapper, name, lambda *_, value=value: value)
-    monkeypatch.setattr(reconstruct, "replace", lambda _, **changes: SimpleNamespace(
+    monkeypatch.setattr(mapping, "replace", lambda _, **changes: SimpleNamespace(
         request=SimpleNamespace(options=SfmOptions()), gps_priors=None, threads=1,
         image_list=SimpleNamespace(images=[photo]), **{k: v for k, v in changes.items() if k == "images"}))  # fmt: skip
-    plan = reconstruct.replace(None)
+    plan = mapping.replace(None)
     console = Console(record=True, width=300)
     for _ in range(2):
-        reconstruct._mapped(plan, Workspace(tmp_path), [replace(GOPRO, images=(photo,))], "key", 6, console)
+        mapping.map_photographs(plan, Workspace(tmp_path), [replace(GOPRO, images=(photo,))], "key", 6, console)
     assert mapper.keys == ["key", "key, fisheyes", "key, fisheyes"]
     said = console.export_text()
     assert ("no two photographs" if fails else "GoPro HERO4 Black: a fisheye, as the photographs tell") in said
@@ -160,7 +160,7 @@ def test_models_are_made_anew_with_fisheyes_once(tmp_path, monkeypatch, fails):
     plan.request.options = asked
     if fails:
         with pytest.raises(CaptureError):
-            reconstruct._mapped(plan, Workspace(tmp_path / "asked"), [GOPRO], "key", 6, console)
+            mapping.map_photographs(plan, Workspace(tmp_path / "asked"), [GOPRO], "key", 6, console)
 
 
 def test_no_perspective_lens_sees_more_than_there_are():

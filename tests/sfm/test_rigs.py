@@ -15,7 +15,7 @@ from rich.console import Console
 
 from support.flights import write_photograph
 from support.known_flight import known_flight
-from vdgs.sfm import incremental_mapper, reconstruct
+from vdgs.sfm import incremental_mapper, mapping
 from vdgs.sfm.camera_rigs import describe_rigs, map_rigs
 from vdgs.sfm.feature_extraction import create_database, group_by_camera
 from vdgs.sfm.image_list import collect_images
@@ -211,5 +211,5 @@ def test_models_that_are_made_anew_begin_without_rigs(tmp_path, monkeypatch):
     monkeypatch.setattr(incremental_mapper, "run_mapper", stopped)
     plan = SimpleNamespace(image_list=collect_images([tmp_path / "photos"]), threads=1)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct._models(plan, workspace, "another key", 16, False, CONSOLE)
+        mapping.make_models(plan, workspace, "another key", 16, False, CONSOLE)
     assert found == [1, 1]
