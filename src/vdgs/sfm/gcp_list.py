@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,12 +24,10 @@ from vdgs.captures.coordinate_systems import (
 )
 from vdgs.captures.known_distances import MIN_OBSERVATIONS
 from vdgs.captures.name_resolution import NameLookup, find_one
-from vdgs.captures.system_names import defines_a_system, join_definition, names_a_system
-from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, number_of, told_meters
-from vdgs.captures.text_tables import Line, read_lines, rows_of, separator_of, with_decimal_points
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import is_collinear
+from vdgs.sfm.gcp_lines import GcpLine, parse_line, read_rows
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
@@ -45,10 +42,6 @@ ALL_POINTS = "all"
 CHECK_PREFIX = "CHK-"
 #: Points higher above or below the sea are none (metres).
 _MAX_HEIGHT_M = 20_000.0
-#: A line of the list, or of names of its columns, has so many words: x, y, z and a mark.
-_LEAST_WORDS = 5
-#: How names of photographs end.
-_PHOTOGRAPH = re.compile(r"\.(jpe?g|tiff?|png|dng|heic|webp)$", re.I)
 #: Marks of one point in one photograph that are farther apart are of different things (pixels; choice).
 _ONE_MARK_PX = 1.0
 
@@ -125,17 +118,8 @@ class GcpList:
         return latitude, longitude, float(np.median(heights)) if len(heights) else 0.0
 
 
-@dataclass(frozen=True)
-class _Line:
-    number: int
-    place: tuple[float, float, float]
-    pixel: tuple[float, float]
-    photograph: str
-    name: str
-
-
 #: A line, and its mark; None in a photograph that was left out.
-_Marked = tuple[_Line, GcpObservation | None]
+_Marked = tuple[GcpLine, GcpObservation | None]
 
 
 def read_gcp_list(file: Path, collection: ImageList, check_points: Sequence[str]) -> GcpList:
@@ -175,7 +159,7 @@ class _Listed(NamedTuple):
     """What a file has, places in the units of its system."""
 
     header: str
-    lines: list[_Line]
+    lines: list[GcpLine]
     transform: Any
     """From the system to WGS 84."""
     system: str
@@ -186,10 +170,10 @@ class _Listed(NamedTuple):
 
 
 def _listed(file: Path) -> _Listed:
-    header, rows, (across, along, up) = _rows(file)
+    header, rows, (across, along, up) = read_rows(file)
     transform, system = to_geodetic(header, file)
     height = 1.0 if up is None else up / height_unit(header)
-    lines = [_line(row, file, height) for row in rows]
+    lines = [parse_line(row, file, height) for row in rows]
     places = np.array([line.place[:2] for line in lines]).reshape(-1, 2)
     units, note = believed_units(header, (across, along), places, file)
     wide, long = (in_units_of(header, unit, file) for unit in units)
@@ -213,7 +197,7 @@ def _by_point(found: Sequence[_Marked]) -> list[tuple[str, list[_Marked]]]:
     return [(group[0][0].name or free(k), group) for k, group in enumerate(groups.values(), 1)]
 
 
-def _said_of_points(points: Sequence[GroundControlPoint], lines: Sequence[_Line]) -> list[str]:
+def _said_of_points(points: Sequence[GroundControlPoint], lines: Sequence[GcpLine]) -> list[str]:
     """What people should know of points that have no height, or 0, and of those that names hold out."""
     said = []
     flat = [point.name for point in points if math.isnan(point.geodetic[2])]
@@ -227,8 +211,8 @@ def _said_of_points(points: Sequence[GroundControlPoint], lines: Sequence[_Line]
 
 
 def _of_photographs(
-    lines: Sequence[_Line], by_name: NameLookup[ImageMetadata | str], file: Path
-) -> tuple[list[_Line], list[str]]:
+    lines: Sequence[GcpLine], by_name: NameLookup[ImageMetadata | str], file: Path
+) -> tuple[list[GcpLine], list[str]]:
     """The lines of photographs that are there, and what to say of the others. CaptureError where none is."""
     there = [line for line in lines if _photographs_of(line.photograph, by_name)]
     names = list(dict.fromkeys(line.photograph for line in lines if line not in there))
@@ -248,7 +232,9 @@ def _photographs_of(name: str, by_name: NameLookup[ImageMetadata | str]) -> list
     return by_name.find(name)[1] or by_name.find_elsewhere(name)[1]
 
 
-def _geodetic(lines: Sequence[_Line], name: str, transform: Any, system: str, file: Path) -> tuple[float, float, float]:
+def _geodetic(
+    lines: Sequence[GcpLine], name: str, transform: Any, system: str, file: Path
+) -> tuple[float, float, float]:
     """Latitude, longitude and height of a point that lines speak of."""
     first = lines[0]
     other = next((line for line in lines if line.place != first.place), None)
@@ -284,141 +270,6 @@ def check_gcps_near(gcps: GcpList, positions: np.ndarray, origin: tuple[float, f
             f"{file}: its points lie {away / 1000:,.0f} km from the photographs. Is {gcps.crs} the right system "
             "and zone, and x (east) before y (north)?"
         )
-
-
-def _rows(file: Path) -> tuple[str, list[Row], tuple[float | None, float | None, float | None]]:
-    """The first line, and the words of the others, parted by blanks, or as in a CSV table; without names of columns, of
-    which the metres in one of x, y and z are given where they say a unit."""
-    lines = _lines_below_system(file)
-    if not lines:
-        raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
-    _check_is_list([line.text for line in lines], file)
-    text, count = join_definition([line.text for line in lines])
-    header, lines = Line(lines[0].number, text), lines[count:]
-    rows = [Row(line.number, line.text.split()) for line in lines]
-    if separator_of([line.text for line in lines]) is None:
-        rows = [Row(number, [*with_decimal_points(words[:5]), *words[5:]]) for number, words in rows]
-    else:
-        rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
-    if not rows or any(map(_is_number, rows[0].words[:5])):
-        return header.text, rows, (None, None, None)
-    _check_order(rows[0], file)
-    x, y, z = (rows[0].words + 3 * [""])[:3]
-    return header.text, rows[1:], (told_meters(x), told_meters(y), told_meters(z))
-
-
-def _lines_below_system(file: Path) -> list[Line]:
-    """The line that names the coordinate system, and those below it without comments. Where the first line is of the
-    list already, the last comment above that defines a system; any other first line is meant to name it."""
-    lines = [line._replace(text=line.text.strip()) for line in read_lines(file, "list of control points")]
-    body = [line for line in lines if not line.text.startswith("#")]
-    if not body or names_a_system(body[0].text) or not _is_of_list(body[0].text):
-        return body
-    above = [line.text.lstrip("# ") for line in lines if line.number < body[0].number]
-    system, k = list[Line](), 0
-    while k < len(above):
-        text, count = join_definition(above[k:])
-        if defines_a_system(text):
-            system = [Line(lines[k].number, text)]
-        k += count
-    return [*system, *body]
-
-
-def _is_of_list(text: str) -> bool:
-    """Whether a line is a mark, or the names of columns, and no name of a system."""
-    words = re.split(r"[\s,;]+", text)
-    if len(words) < _LEAST_WORDS:
-        return False
-    is_named = [word[-1:].lower() for word in words[:3]] == ["x", "y", "z"]  # `geo_x geo_y geo_z`, as ODM names them
-    known = known_columns(rows_of([Line(1, text)])[0].words)
-    return is_named or len(known) > 1 or sum(map(_is_number, words[:5])) > 2
-
-
-def _check_is_list(lines: Sequence[str], file: Path) -> None:
-    """Raise CaptureError for what programs export of control points without, or otherwise with, their marks."""
-    kind = _other_format(lines[0].lstrip("\ufeff")) or _half_a_list(lines)
-    if kind:
-        raise CaptureError(
-            f"{file}: is {kind}. --gcp takes ODM's list: a line that names the coordinate system (EPSG:32615), and for "
-            "each mark a line `x y z px py photograph name`. Export it so, or put it together from both."
-        )
-
-
-def _other_format(first: str) -> str:
-    """What a file is by its beginning, where that is no list of lines with words; empty for a list."""
-    if first.startswith("<"):
-        return "XML, as Metashape writes markers, or KML or LandXML points"
-    if first.startswith(("{", "[")):
-        return "JSON"
-    if re.match(r"\*?11\d{4}[+-]\w{8}", first):
-        return "a measurement file of Leica (GSI), of points without their marks in photographs"
-    return ""
-
-
-def _half_a_list(lines: Sequence[str]) -> str:
-    """What a table has, where it is of points without marks or of marks without points; empty for others."""
-    words, second = (re.split(r"[\s,;]+", line) for line in (lines[0], lines[min(1, len(lines) - 1)]))
-    if _PHOTOGRAPH.search(words[0]) and len(words) > 3 and all(map(_is_number, words[2:4])):
-        return "a table of marks without the coordinates of their points"
-    if names_a_system(lines[0]):  # WKT names axes as tables name columns
-        return ""
-    columns = known_columns(re.split(r"[,;\t]", lines[0]))
-    named = {"x", "y"} <= set(columns) or {"lat", "lon"} <= set(columns)
-    numbered = len(words) > 3 and all(map(_is_number, words[1:4]))
-    if (named or numbered) and not (_is_mark(words) or _is_mark(second)):
-        return "a table of points without their marks in photographs"
-    return ""
-
-
-def _is_mark(words: Sequence[str]) -> bool:
-    """Whether words name a photograph, or are five numbers and a name."""
-    row = len(words) > 5 and all(map(_is_number, words[:5])) and not _is_number(words[5])
-    return row or any(map(_PHOTOGRAPH.search, words))
-
-
-def _check_order(names: Row, file: Path) -> None:
-    """Raise CaptureError where a line of column names has x, y and z elsewhere than in front."""
-    known = known_columns(names.words)
-    for place, columns in enumerate((("x", "lon"), ("y", "lat"), ("alt",))):
-        if any(known.get(what, place) != place for what in columns):
-            raise CaptureError(
-                f"{file}: line {names.number}: the columns {', '.join(names.words)[:80]} are in another order than "
-                "`x y z px py photograph [name]` (x is east or longitude). Put them into this order."
-            )
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return math.isfinite(float(word))
-    except ValueError:
-        return False
-
-
-def _number(word: str) -> float:
-    """A number, also with signs between thousands. ValueError for anything else."""
-    found = number_of(word)
-    return float(word) if math.isnan(found) else found
-
-
-def _line(row: Row, file: Path, height: float) -> _Line:
-    """What a line says, its height times `height`."""
-    number, words = row
-    try:
-        flat = words[2].strip().lower() in UNKNOWN or number_of(words[2]) in NO_DATA
-        x, y, z, across, down = map(_number, [*words[:2], "0" if flat else words[2], *words[3:5]])
-        photograph = words[5].strip()
-    except (ValueError, IndexError):
-        alone = " Surveyed points alone do not say where photographs show them." if len(words) < 6 else ""
-        line = " ".join(words)[:80]
-        alone = alone or " (nan for a height that is not known.)"
-        raise CaptureError(
-            f"{file}: line {number}: {line!r} is not `x y z px py photograph [name]`. Mend the line.{alone}"
-        ) from None
-    if not all(map(math.isfinite, (x, y, z, across, down))):
-        raise CaptureError(f"{file}: line {number}: numbers must be finite. Mend the line.")
-    name = words[6].strip() if len(words) > 6 else ""
-    place = x, y, math.nan if flat else z * height  # the one NaN: places of it are equal
-    return _Line(number, place, (across, down), photograph, name)
 
 
 def photographs_by_name(collection: ImageList) -> NameLookup[ImageMetadata | str]:
@@ -468,7 +319,7 @@ def _held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> list
 
 def _check_one_mark(group: Sequence[_Marked], name: str, file: Path) -> None:
     """Raise CaptureError where a photograph shows a point at two places."""
-    marked: dict[str, _Line] = {}
+    marked: dict[str, GcpLine] = {}
     for line, sighting in group:
         if sighting is None:
             continue
