@@ -106,7 +106,7 @@ def _find_fisheyes(
         if workspace.is_done("focal", key):  # looked at before
             return models, []
         found = fisheyes.candidates(kinds, models[0])
-        errors = fisheyes.compare(models[0], kinds, found, plan.threads)
+        errors = fisheyes.compare(models[0], kinds, found, plan.threads) if found else None
         if errors is None:
             return models, []
         names = ", ".join(dict.fromkeys(kinds[number - 1].camera for number in found))
