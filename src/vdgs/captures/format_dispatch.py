@@ -71,13 +71,13 @@ def read_source(root: Path, options: CaptureOptions, *, needs_points: bool = Tru
     if below:
         raise CaptureError(f"{root}: not a capture itself. {below}")
     others = "".join(f"Not read: {poses}. " for poses in foreign_poses(root)) if root.is_dir() else ""
-    photographs = shell_word(root) if not root.is_dir() or find_images(root) else "PHOTOGRAPHS"
+    photographs = root if not root.is_dir() or find_images(root) else "PHOTOGRAPHS"
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}{others}Looked for a COLMAP model (sparse/0/cameras.bin and "
         "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF), transforms_train.json "
         "(MatrixCity), cams/*_cam.txt (MVSNet), poses_bounds.npy (LLFF) "
         f"and projects of {', '.join(form.program for form in PROJECTS.values())}. Photographs alone "
-        f"become one first: vdgs sfm {photographs} --output CAPTURE"
+        f"become one first: vdgs sfm {shell_word(photographs)} --output CAPTURE"
     )
 
 
