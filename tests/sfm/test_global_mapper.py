@@ -17,7 +17,7 @@ pycolmap = pytest.importorskip("pycolmap")
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import VdgsError  # noqa: E402
 from vdgs.geometry.similarity import fit_similarity  # noqa: E402
-from vdgs.sfm import global_mapper, incremental_mapper, reconstruct  # noqa: E402
+from vdgs.sfm import global_mapper, incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.feature_matching import count_verified_matches  # noqa: E402
 from vdgs.sfm.workspace import Workspace, silence_colmap  # noqa: E402
 
@@ -125,7 +125,7 @@ def copied(mapped, tmp_path) -> Workspace:
 def models_of(workspace: Workspace, key: str = "key") -> list[int]:
     """As `vdgs sfm` makes them, or goes on with them."""
     plan = SimpleNamespace(image_list=SimpleNamespace(images=[]), threads=1)
-    return [len(model.images) for model in reconstruct._models(plan, workspace, key, 16, True, CONSOLE)]
+    return [len(model.images) for model in mapping.make_models(plan, workspace, key, 16, True, CONSOLE)]
 
 
 def python_that(folder: Path, script: str) -> str:
@@ -193,11 +193,11 @@ def test_a_focal_length_that_the_photographs_contradict_is_fitted_anew_and_work_
             raise KeyboardInterrupt
         return [None]
 
-    monkeypatch.setattr(reconstruct, "_models", map_with)
+    monkeypatch.setattr(mapping, "make_models", map_with)
     monkeypatch.setattr(incremental_mapper, "is_contradicted", lambda *_: True)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct._mapped(plan, copied, [], "key", 16, CONSOLE)
-    assert reconstruct._mapped(plan, copied, [], "key", 16, CONSOLE)[1] == (False, incremental_mapper.CONTRADICTED)
+        mapping.map_photographs(plan, copied, [], "key", 16, CONSOLE)
+    assert mapping.map_photographs(plan, copied, [], "key", 16, CONSOLE)[1] == (False, incremental_mapper.CONTRADICTED)
     assert made == [True, False, False]
 
 
