@@ -142,3 +142,16 @@ def test_cameras_as_high_and_as_wide_as_no_scene():
     assert why_no_scene(strips(60, 10, 77_278), 0.0) == "the cameras would be 77 km over the ground"
     assert "under" in why_no_scene(strips(60, 10, -77_278), 0.0)
     assert "5,000 km" in why_no_scene(strips(60, 10, 120) * [1e5, 1, 1], 0.0)
+
+
+def test_few_positions_of_a_long_flight_are_no_steps_from_one_photograph_to_the_next():
+    line = np.column_stack([48 + np.arange(3) * 5 / 111, np.full(3, 11.0), np.full(3, 100.0)])
+    assert "km from one to the next" in why_no_flight(line)
+    assert not why_no_flight(line, 200)
+    assert not why_no_flight(np.vstack([line, np.full((197, 3), np.nan)]))
+
+
+def test_a_camera_that_was_placed_badly_makes_no_scene_too_wide():
+    cameras = strips(60, 10, 120, 60)
+    cameras[7] = 2e6, 0, 9e5
+    assert not why_no_scene(cameras, 0.0)

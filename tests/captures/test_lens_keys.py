@@ -150,3 +150,35 @@ def test_terms_that_a_projection_of_opensfm_has_not_are_named(kind, term):
     assert isinstance(opensfm_lens(camera | {term: 0.0}, "one", Path("a.json")), Intrinsics)
     said = opensfm_lens(camera | {term: 0.1}, "one", Path("a.json"))
     assert said == f"the lens parameter {term} of the camera 'one', of a projection '{kind}', is not supported"
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        {"distortion_model": "undistorted", "dist": 3.5},  # the distance to something
+        {"K": [[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]]},  # of the photograph before it was shrunk
+        {"K": [[0.8, 0, 0.5], [0, 1.1, 0.5], [0, 0, 1]]},
+        {"fx": 500.0, "width": 640, "height": 480},
+    ],
+)
+def test_other_keys_beside_the_focal_length_of_all_leave_it_as_it_is(says):
+    without = {key: value for key, value in HEAD.items() if key not in ("cx", "cy")}
+    assert lens_of(without | says) == lens_of(without)
+    assert lens_of(HEAD | says) == lens_of(HEAD)
+
+
+def test_the_size_of_the_known_focal_length_is_read():
+    named = {"fl_x": 50.0, "fl_y": 51.0, "fx": 50.0, "width": 64, "height": 48}
+    assert lens_of(named) == lens_of(HEAD)
+
+
+def test_whole_numbers_in_the_lens_of_a_frame_are_read():
+    lens = lens_of(HEAD, {"intrinsics": {"fx": 70, "fy": 70, "cx": 32, "cy": 24}})
+    assert lens.params == (70.0, 70.0, 32.0, 24.0)
+
+
+def test_the_same_distortion_with_fewer_digits_is_no_contradiction():
+    written = dict(zip(("k1", "k2", "p1", "p2"), (-0.200001, 0.0500001, 0.001, -0.002), strict=True))
+    assert lens_of(HEAD | written | {"distortion": RADTAN}) == lens_of(HEAD | written)
+    named = {"k1": -0.2, "distortion_model": "SIMPLE_RADIAL"}
+    assert lens_of(HEAD | named).params[4:] == (-0.2, 0.0, 0.0, 0.0)

@@ -102,6 +102,19 @@ def test_heights_that_nothing_tells_are_metres_and_the_note_says_how_to_say_it()
     assert with_height_unit(said, located, ORIGIN, 0.01, gps(3.0, 60.0), "EXIF") == (said, "")
 
 
+def test_a_bent_model_of_the_other_shape_decides_nothing_against_gps():
+    """A hollow that the model shows as deep as the wrong unit has it."""
+    places = surveyed(6, 0.0, 290.0, np.random.default_rng(2))
+    hollow = ((places[:, :2] / 60) ** 2).sum(axis=1)
+    places[:, 2] += 3 * hollow
+    bent = places - np.outer(3 * (1 - SURVEY_FOOT_M) * hollow, [0, 0, 1])
+    listed, located = list_of(places, False), dict(enumerate(bent))
+    assert with_height_unit(listed, located, ORIGIN, 0.01, None, "EXIF")[0] is not listed
+    read, note = with_height_unit(listed, located, ORIGIN, 0.01, gps(2.0), "EXIF")
+    assert read is listed
+    assert "nothing tells" in note
+
+
 def test_control_points_that_contradict_good_positions_are_said():
     by = gps(1.0)
     placed = replace(by, residuals=np.tile([0.3, 0.2, 25.8], (3, 1)))

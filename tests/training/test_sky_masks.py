@@ -76,6 +76,21 @@ def test_a_wall_is_no_sky_by_its_color_or_its_points(color: tuple[float, float, 
     assert empty[tuple(wall.T)].mean() < 0.03
 
 
+def test_snow_before_a_white_sky_with_points_here_and_there_is_no_sky() -> None:
+    """An edge parts it from the sky, and no three of its points lie together."""
+    rng, up = np.random.default_rng(1), ray_directions(CAMERA)[..., 2].numpy()
+    snow = (up > 0) & (up < math.sin(math.radians(8)))
+    image = np.where(snow, 240, np.where(up > 0, 255, 90))[..., None] + rng.normal(0, 1, (*up.shape, 3))
+    x, elevation = rng.uniform(-100, 100, 1800), np.full(1800, 8.0)
+    elevation[1600:] = rng.uniform(0, 8, 200)  # the others are along the ridge
+    z = 12 + np.hypot(x, 100) * np.tan(np.radians(elevation))
+    points = np.column_stack([x, np.full(1800, 100.0), z])
+    skyline, white = find_skyline(CAMERA.position, points), torch.ones(64, 256, 3)
+    found = find_sky_mask(torch.from_numpy(image.clip(0, 255).astype(np.uint8)), CAMERA, skyline, white, points)
+    assert found is not None
+    assert found.sky_at(CAMERA).numpy()[snow].mean() < 0.2
+
+
 def test_no_ground_is_empty_sky() -> None:
     """Water and fog below the horizon that look like sky: the map may be behind them, but they may be solid."""
     gray = torch.from_numpy(np.full((240, 320, 3), [int(255 * c) for c in SKY], np.uint8))

@@ -28,17 +28,20 @@ WIDEST_M = 500_000.0
 #: No camera is farther from the ground, in metres: aircraft are at 10 to 20 km, balloons at 35 km (choice).
 HIGHEST_OVER_GROUND_M = 40_000.0
 _MIN_PLACES = 3
+#: Cameras of a scene are compared without 5 % on each side.
+_ENDS = (0.05, 0.95)
 
 
-def why_no_flight(geodetic: Float[np.ndarray, "n 3"]) -> str:
+def why_no_flight(geodetic: Float[np.ndarray, "n 3"], photographs: int = 0) -> str:
     """Why positions (degrees, metres; NaN where unknown) cannot be of photographs of one flight, in words; empty where
-    they can. Those at 0, 0 and copies of others do not count, few strays and several sites do no harm."""
+    they can. Those at 0, 0 and copies of others do not count, few strays and several sites do no harm. Where there are
+    more `photographs` than positions, others lie between these."""
     known = geodetic[np.isfinite(geodetic[:, :2]).all(axis=1) & ~are_nowhere(geodetic)]
     distinct = np.unique(known[:, :2], axis=0)
     if len(distinct) < _MIN_PLACES:
         return ""
     level = np.column_stack([distinct, np.zeros(len(distinct))])
-    step = _median_step(level)
+    step = _median_step(level) * min(1.0, len(distinct) / max(len(geodetic), photographs))
     if step > _LARGEST_STEP_M:
         return f"they lie {step / 1000:,.0f} km from one to the next (median)"
     altitudes = known[np.isfinite(known[:, 2]), 2]
@@ -61,7 +64,8 @@ def why_no_scene(centers: Float[np.ndarray, "n 3"], ground: float) -> str:
     height = float(np.median(centers[:, 2])) - ground
     if abs(height) > HIGHEST_OVER_GROUND_M:
         return f"the cameras would be {abs(height) / 1000:,.0f} km {'over' if height > 0 else 'under'} the ground"
-    wide = float(np.ptp(centers, axis=0).max())
+    # Few cameras that were placed badly do no harm.
+    wide = float(np.ptp(np.quantile(centers, _ENDS, axis=0), axis=0).max())
     return f"the cameras would lie over {wide / 1000:,.0f} km" if wide > WIDEST_M else ""
 
 

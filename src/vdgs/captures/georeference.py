@@ -159,7 +159,7 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
             f"{file}: none of its {len(rows)} rows names one of the capture's {len(names)} images "
             f"(for example {names[0]!r}). Give the table of this flight, or leave --gps out."
         )
-    if why := why_no_flight(np.array([row.position for row in found.values()])):
+    if why := why_no_flight(np.array([row.position for row in found.values()]), len(names)):
         latitude, longitude, _ = next(iter(found.values())).position
         raise CaptureError(
             f"{file}: its positions, such as {latitude:.10g}, {longitude:.10g}, are no latitudes and longitudes of one "

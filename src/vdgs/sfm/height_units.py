@@ -45,8 +45,9 @@ def with_height_unit(
     gps: Georegistration | None,
     gps_source: str,
 ) -> tuple[GcpList, str]:
-    """The list with heights in the feet of x and y where points and photographs, or else GPS, tell that they are; and
-    what to say of that, also where nothing tells. Lists whose unit of heights is said stay as they are.
+    """The list with heights in the feet of x and y where points and photographs, or else GPS, tell that they are, and
+    neither contradicts the other; and what to say of that, also where nothing tells. Lists whose unit of heights is
+    said stay as they are.
 
     `located` are the places [3] of points in the model by their number, `pixel` what one shows there in its unit.
     """
@@ -58,8 +59,10 @@ def with_height_unit(
     used = used or [k for k in located if math.isfinite(meters[k, 2])]
     places = np.array([located[k] for k in used]).reshape(-1, 3)
     found = by_shape(places, meters[used], feet[used], pixel)
-    if found.in_feet is None and gps is not None:
-        found = by_gps(places, meters[used], feet[used], gps, gps_source)
+    if gps is not None:
+        told = by_gps(places, meters[used], feet[used], gps, gps_source)
+        # A bent model may have the shape that the wrong unit gives.
+        found = told if found.in_feet is None else found if told.in_feet in (None, found.in_feet) else Found(None)
     ways = _ways_to_say(control)
     if found.in_feet:
         return in_feet, f"{control.source}: its heights are read in feet, as x and y are: {found.why}. {ways}"

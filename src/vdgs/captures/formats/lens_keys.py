@@ -27,11 +27,11 @@ FOCAL = frozenset({"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"})
 #: their coefficients are zero.
 _POLYNOMIAL = {
     "plumb_bob", "radtan", "radtan8", "radial_tangential", "brown", "brown_conrady", "rational_polynomial", "opencv",
-    "full_opencv", "pinhole", "perspective",
+    "full_opencv", "pinhole", "simple_pinhole", "perspective", "simple_radial", "radial", "brown5", "opencv5",
 }  # fmt: skip
 _FISHEYE = {"equidistant", "equi", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "kb4"}
 _POLYNOMIAL_IF_ZERO = {"inverse_brown_conrady", "modified_brown_conrady"}
-_NO_MODEL = {"", "none", "no", "false", "null"}
+_NO_MODEL = {"", "none", "no", "false", "null", "undistorted", "rectified", "ideal", "linear"}
 #: Keys of such names; the model of a lens may be that of a shop.
 _MODEL_KEYS, _LOOSE_MODEL_KEYS = ("distortion_model", "distortion_type", "distortion"), ("lens_model", "model")
 #: Of which kind keys are, without case, underscores, spaces and hyphens: coefficients in OpenCV's order, matrices of
@@ -67,6 +67,8 @@ _KNOWN = {*LENS, "distortion_params", "is_fisheye", "camera_model", "frames", "t
 #: Keys that nerfstudio's lens has not, which are looked at in `json_poses` as the others are.
 OTHER_PARAMETERS = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "rolling_shutter")
 _NESTED = (*LENS, *OTHER_PARAMETERS)
+#: Numbers that differ by so much (share) are one, written with fewer digits (choice).
+_ROUNDED = 1e-4
 _REMEDY = "Write k1, k2, p1, p2 (and k3) of OpenCV's lens, or undistort the images first."
 #: By its length, where fx, fy, cx, cy are in a matrix row by row, and where its ones are.
 _PLACES = {4: (0, 1, 2, 3), 9: (0, 4, 2, 5), 12: (0, 5, 2, 6), 16: (0, 5, 2, 6)}
@@ -113,9 +115,11 @@ def with_known_keys(values: Mapping[str, Any], fisheye: bool, file: Path) -> Jso
     has_focal = not FOCAL.isdisjoint(found)
     for inner in (values, *_objects(values)):
         kinds = {key: kind for key, value in inner.items() if value is not None and (kind := _kind(key)) is not None}
-        with_focal = any(kind == "matrix" or _plain(key) in ("fx", "focalx") for key, kind in kinds.items())
+        focals = [inner[key] for key, kind in kinds.items() if kind == "matrix" or _plain(key) in ("fx", "focalx")]
+        # Beside a known focal length the others may be of the photograph before it was shrunk, and so its size.
+        has_size = bool(focals) and (not has_focal or any(_starts_with(each, found.get("fl_x")) for each in focals))
         for key, kind in kinds.items():
-            if (kind != "size" or with_focal) and not (has_focal and kind == "same" and "f" in _plain(key)):
+            if (kind != "size" or has_size) and not (has_focal and kind == "same" and "f" in _plain(key)):
                 _read_key(found, key, kind, inner[key], fisheye, file)
         for key in () if inner is values else [each for each in _NESTED if each in inner]:
             _add_terms(found, {key: inner[key]}, key, file)
@@ -138,7 +142,7 @@ def check_own_matrix(frame: Mapping[str, Any], own: Mapping[str, Any], size: tup
     if key is None or "w" in own or not FOCAL.isdisjoint(frame):
         return
     (low, high), center = CENTERED, [own.get("cx"), own.get("cy")]
-    if not all(isinstance(c, float) and low < c / side < high for c, side in zip(center, size, strict=True)):
+    if not all((c := _numbers(each)) and low < c[0] / side < high for each, side in zip(center, size, strict=True)):
         raise CaptureError(
             f"{file}: {key!r} of a frame has its principal point at {center[0]}, {center[1]}, and w and h are "
             f"{size[0]:g}x{size[1]:g}: it is of another size. Write w and h of the frame beside it, or remove it."
@@ -164,9 +168,10 @@ def _read_key(found: JsonObject, key: str, kind: _Kind, value: Any, fisheye: boo
     """Add what one key of another program says of the lens to what is `found`."""
     numbers = _numbers(value)
     listed = numbers if isinstance(value, list | dict) else None
-    if kind == "list" and listed is not None:
-        if key.lower() != "dist" or len(listed) >= 4:  # else any distances
-            _add_terms(found, _terms(key, listed, fisheye, file), key, file)
+    if key.lower() == "dist" and numbers is not None and len(numbers) < 4:
+        pass  # any distances
+    elif kind == "list" and listed is not None:
+        _add_terms(found, _terms(key, listed, fisheye, file), key, file)
     elif kind == "list" and isinstance(value, dict | str):
         pass  # the object is gone through, the text is the name of a model
     elif kind == "radial" and listed is not None and len(listed) <= (4 if fisheye else 3):
@@ -210,11 +215,27 @@ def _add_terms(found: JsonObject, terms: JsonObject, key: str, file: Path) -> No
     bends = any(any(_numbers(value) or ()) for value in terms.values())
     for name, value in terms.items():
         there = found.get(name)
-        if there is not None and bends and _numbers(there) != _numbers(value):
+        if there is not None and bends and not _agree(there, value):
             raise CaptureError(
                 f"{file}: the lens distortion under {key!r} contradicts {name} {there}. Leave one of them in the file."
             )
         found.setdefault(name, value)
+
+
+def _agree(there: object, value: object) -> bool:
+    """Whether two values are the same but for how they are rounded."""
+    ones, others = _numbers(there) or [], _numbers(value) or []
+    return len(ones) == len(others) and all(map(_almost_equal, ones, others))
+
+
+def _starts_with(value: object, number: object) -> bool:
+    """Whether a focal length, or the first number of a matrix, is a number."""
+    found, known = _numbers(value), _numbers(number)
+    return bool(found and known and _agree(found[:1], known))
+
+
+def _almost_equal(one: float, other: float) -> bool:
+    return math.isclose(one, other, rel_tol=_ROUNDED, abs_tol=_ROUNDED**2)
 
 
 def _add_matrix(found: JsonObject, key: str, numbers: list[float], file: Path) -> None:
@@ -235,8 +256,16 @@ def _add_matrix(found: JsonObject, key: str, numbers: list[float], file: Path) -
     fx, fy, cx, cy = (numbers[place] for place in places)
     if not has_focal:
         found.update(fl_x=fx, fl_y=fy)
+    elif not _is_of_size(found, (cx, cy)):
+        return
     found.setdefault("cx", cx)
     found.setdefault("cy", cy)
+
+
+def _is_of_size(found: Mapping[str, Any], center: tuple[float, float]) -> bool:
+    """Whether a principal point may be of an image of the known size; yes where none is known."""
+    (low, high), sides = CENTERED, [_numbers(found.get(key)) for key in ("w", "h")]
+    return all(not side or low < c / max(side[0], 1) < high for c, side in zip(center, sides, strict=True))
 
 
 def _bends(values: Mapping[str, Any]) -> bool:

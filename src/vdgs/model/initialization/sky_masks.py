@@ -99,12 +99,16 @@ def find_sky_mask(
     if (above & smooth).any():  # the photograph's own brightness
         apart -= np.median(apart[above & smooth], axis=0)
     alike = (np.abs(apart).max(axis=2) <= MAX_DIFFERENCE) & (up > math.sin(PLAIN_ELEVATION))
-    alike &= ~_shows_points(points, camera)
+    shown = _shown_points(points, camera)
+    alike &= ~_shows_points(shown)
     count, parts = cv2.connectedComponents((alike & smooth).astype(np.uint8), connectivity=4)
     grows = np.bincount(parts[above & smooth], minlength=count) > 0
     opens = np.bincount(parts[up > 0], minlength=count) > 0
     # What shows below a bridge or through a frame.
     opens &= np.bincount(parts.ravel(), minlength=count) >= MIN_APERTURE * parts.size
+    # A white wall or snow before a white sky has points here and there; those at outlines are of what stands there.
+    deep = cv2.erode((parts > 0).astype(np.uint8), np.ones((2 * CLUSTER_PX + 1,) * 2, np.uint8)) * shown
+    opens &= np.bincount(parts.ravel(), deep.ravel(), minlength=count) < MIN_POINTS
     grows[0] = opens[0] = False
     grown = grows[parts]
     border = cv2.dilate((grows | opens)[parts].astype(np.uint8), np.ones((2 * BORDER_PX + 1,) * 2, np.uint8)) > 0
@@ -127,11 +131,16 @@ def _change(pixels: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     return (cv2.dilate(blurred, around) - cv2.erode(blurred, around)).max(axis=2)
 
 
-def _shows_points(points: Float[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, "h w"]:
-    """The pixels around points of the scene; not around one or two alone, which are mismatches."""
+def _shown_points(points: Float[np.ndarray, "n 3"], camera: Camera) -> Float[np.ndarray, "h w"]:
+    """How many points of the scene lie behind each pixel."""
     shown, (at, depth) = np.zeros((camera.height, camera.width), np.float32), camera.project(points)
     columns, rows = np.floor(at[camera.holds(at, depth)]).astype(int).T
     np.add.at(shown, (rows, columns), 1.0)
+    return shown
+
+
+def _shows_points(shown: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels around points of the scene; not around one or two alone, which are mismatches."""
     many = cv2.boxFilter(shown, -1, (2 * CLUSTER_PX + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
     near = ((shown > 0) & (many > MIN_POINTS - 0.5)).astype(np.uint8)
     return cv2.dilate(near, np.ones((2 * POINT_PX + 1,) * 2, np.uint8)) > 0
