@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vdgs.captures.gps_altitudes import wrong_reading
-from vdgs.captures.position_adjustment import PositionFit, Problem, Up
+from vdgs.captures.position_adjustment import PositionFit, Problem, Up, settle
 from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.up_axis import VIEWS_DEG, up_by_views
 from vdgs.sfm.flights import altitude_offsets
@@ -304,6 +304,37 @@ def test_altitudes_along_one_strip_are_no_drift_of_dozens_of_metres():
         assert abs(fit.similarity.scale - 1) < 0.015
         within += [tilt_deg(fit) <= fit.level_error_deg, abs(fit.similarity.scale - 1) <= fit.scale_error]
     assert np.mean(within) >= 0.9
+
+
+def drifting_strip(seed: int, drift_m: float, deviation_deg: float, sag_m: float) -> Problem:
+    """The strip with altitudes that drift along it, and up by views that are 2 degrees off."""
+    _, problem = strip(seed, sag_m)
+    drifting = problem.targets + np.outer(drift_m * problem.times, [0, 0, 1])
+    return replace(problem, targets=drifting, up=replace(problem.up, direction=views(2.0).direction,
+                                                         deviation_deg=deviation_deg))  # fmt: skip
+
+
+def test_what_is_likeliest_along_a_strip_is_found_from_wherever_a_fit_begins():
+    """From up by the views, which a long drift contradicts, altitudes that count as they are look like noise: they are
+    compared from where they fit. No fit has them drift by a few metres and the strip climb by all the rest."""
+    for seed in range(6):
+        problem = drifting_strip(seed, 60.0, 6.0, 0.0)
+        fit = fit_positions(problem)
+        again = settle(problem, fit.similarity, "used")
+        assert fit.score <= again.score + 0.1
+        assert fit.altitude == "used"
+
+
+def test_altitudes_drift_by_what_they_change_against_the_heights_of_the_fit():
+    """Where level is as the views have it, a fit of altitudes that takes most of their drift for a climb does not say
+    how far they drift."""
+    for seed in range(4):
+        problem = drifting_strip(seed, 40.0, 3.0, 6.0)
+        fit = fit_positions(problem)
+        assert fit.altitude == "drifts"
+        changed = np.polyfit(problem.times, (problem.targets - fit.placed)[:, 2], 1)[0]
+        assert fit.drift_m == pytest.approx(changed, abs=3)
+        assert fit.place_error_m[1] > abs(changed) / 2
 
 
 def test_level_of_a_grid_holds_a_drift_that_does_not_show():

@@ -163,7 +163,7 @@ def settle(problem: Problem, start: Similarity, model: str) -> PositionFit:
     state = _State(start.scale, start.rotation, start.apply(middle[None])[0], 0.0)
     inliers, times = np.ones(count, bool), problem.times - problem.times.mean()
     if model == "drifts":  # the start has it in the residuals
-        state = replace(state, drift=_slope(times, -_residuals(problem, state, middle, times)[:, 2]))
+        state = replace(state, drift=slope(times, -_residuals(problem, state, middle, times)[:, 2]))
     weights, leverages = np.ones((count, 3)), np.zeros((count, 3))
     for _ in range(ROUNDS):
         residuals = _residuals(problem, state, middle, times)
@@ -215,7 +215,7 @@ def _residuals(problem: Problem, state: _State, middle: np.ndarray, times: np.nd
     return off
 
 
-def _slope(times: np.ndarray, values: np.ndarray) -> float:
+def slope(times: np.ndarray, values: np.ndarray) -> float:
     """Of a line through values [n] by the median of slopes (Theil and Sen)."""
     thin = slice(None, None, 1 + len(times) // 500)
     times, values = times[thin], values[thin]

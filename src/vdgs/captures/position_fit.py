@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from vdgs.captures.gps_altitudes import are_over_ground
 from vdgs.captures.likely_tilts import Likely, Moments, likely_tilts
 from vdgs.captures.plane_fit import ACROSS_TIMES, ENOUGH_TO_DOUBT, fit_plane, in_plane
-from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, alike_factors, settle
+from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, alike_factors, settle, slope
 from vdgs.captures.position_weights import ALIKE_TIMES
 from vdgs.geometry.similarity import Similarity, fit_similarity_robust, is_collinear, rotation_to_z
 
@@ -73,21 +73,29 @@ def fit_positions(problem: Problem) -> PositionFit:
         models.append("drifts")
     found = [settle(problem, start, model) for start in starts for model in models]
     found = [fit for fit in found if abs(fit.drift_m) <= DRIFT_LIMIT_M]
+    likely = min(found, key=lambda fit: fit.score, default=None)
+    if likely is not None and likely.altitude == "drifts":  # by which those that do not drift find the way, too
+        found.append(settle(problem, likely.similarity, "used"))
     plane = _settle_in_plane(problem)
     best = min([plane, *found], key=lambda fit: fit.score)
     if best.altitude == "used" and _says_less_than_views(best, problem):
         best = min((fit for fit in [plane, *found] if fit.altitude != "used"), key=lambda fit: fit.score)
     if best.altitude == "drifts" and _says_less_than_views(best, problem):
-        return _level_as_known(best, plane)
+        return _level_as_known(best, plane, problem)
     return best
 
 
-def _level_as_known(drifting: PositionFit, plane: PositionFit) -> PositionFit:
-    """The fit in the plane with what altitudes that drift say of themselves and of how high the scene lies."""
+def _level_as_known(drifting: PositionFit, plane: PositionFit, problem: Problem) -> PositionFit:
+    """The fit in the plane with what altitudes that drift say of themselves and of how high the scene lies. They drift
+    by what they change against the heights of this fit: the other one may have taken most of that for a tilt."""
+    trusted = drifting.inliers
+    off = (problem.targets - plane.placed)[trusted, 2]
+    drift_m = slope(problem.times[trusted], off)
+    more_m = max(0.0, abs(drift_m) - abs(drifting.drift_m))
     return replace(
-        plane, altitude=drifting.altitude, drift_m=drifting.drift_m, score=drifting.score,
+        plane, altitude=drifting.altitude, drift_m=drift_m, score=drifting.score,
         deviations=drifting.deviations, gps_std=drifting.gps_std,
-        place_error_m=(plane.place_error_m[0], drifting.place_error_m[1]),
+        place_error_m=(plane.place_error_m[0], drifting.place_error_m[1] + more_m / 2),
     )  # fmt: skip
 
 
