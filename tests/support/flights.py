@@ -96,13 +96,17 @@ def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight
 def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
     """Folders as those of a capture of a flight are when each step of its reconstruction begins, but for the first, and
     when it is done (`made`: with its features, matches and models)."""
-    from vdgs.sfm import feature_extraction
+    from vdgs.sfm import feature_extraction, mapping
     from vdgs.sfm import reconstruct as reconstructing
 
     output = folder / "capture"
     with small_figures(), pytest.MonkeyPatch.context() as patch:
-        for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
-            patch.setattr(reconstructing, name, _after_copying(getattr(reconstructing, name), output, folder / step))
+        for step, module, name in (
+            ("matching", reconstructing, "_matches"),
+            ("mapping", mapping, "make_models"),
+            ("writing", reconstructing, "_write"),
+        ):
+            patch.setattr(module, name, _after_copying(getattr(module, name), output, folder / step))
         patch.setattr(reconstructing, "estimate_sfm", unestimated)
         patch.setattr(feature_extraction, "is_upsampled", not_upsampled)
         request = SfmRequest(image_folders=(flight.folder,), output=output, threads=1, keep_intermediate=True)
