@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -138,9 +138,8 @@ class Mapper:
 def test_models_are_made_anew_with_fisheyes_once(tmp_path, monkeypatch, fails):
     mapper, errors = Mapper(fails), [(0.56, 0.13)]
     photo = SimpleNamespace(name="a", camera_model=RADIAL)
-    monkeypatch.setattr(fisheyes, "with_fisheyes", lambda photos, _: [SimpleNamespace(camera_model=FISHEYE)])
+    monkeypatch.setattr(fisheyes, "with_fisheyes", lambda groups, _: groups)
     monkeypatch.setattr(mapping, "make_models", mapper)
-    monkeypatch.setattr(mapping, "group_by_camera", lambda _: [replace(GOPRO, model=FISHEYE)])
     monkeypatch.setattr(fisheyes, "compare", lambda *_: errors.pop())
     monkeypatch.setattr(fisheyes, "use_lenses", lambda *_: None)
     for name, value in (("should_fix_focal", (False, "")), ("release_focal", (False, "")), ("is_contradicted", False),
@@ -161,6 +160,19 @@ def test_models_are_made_anew_with_fisheyes_once(tmp_path, monkeypatch, fails):
     if fails:
         with pytest.raises(CaptureError):
             mapping.map_photographs(plan, Workspace(tmp_path / "asked"), [GOPRO], "key", 6, console)
+
+
+@dataclass(frozen=True)
+class Photo:
+    name: str
+    camera_model: str
+
+
+def test_cameras_keep_their_numbers_where_one_of_them_is_found_to_be_a_fisheye():
+    """One camera whose tags say the fisheye in some photographs alone stays two, as in the database."""
+    untold, told = (replace(GOPRO, model=model, images=(Photo(model, model),)) for model in (RADIAL, FISHEYE))
+    found = fisheyes.with_fisheyes([untold, told], [1])
+    assert found == [replace(untold, model=FISHEYE, images=(Photo(RADIAL, FISHEYE),)), told]
 
 
 def test_no_perspective_lens_sees_more_than_there_are():

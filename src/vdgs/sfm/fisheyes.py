@@ -175,9 +175,13 @@ def _equidistant(
     )  # fmt: skip
 
 
-def with_fisheyes(photographs: Sequence[ImageMetadata], names: set[str]) -> list[ImageMetadata]:
-    """The photographs, those of these names taken through fisheyes."""
-    return [replace(photo, camera_model=FISHEYE) if photo.name in names else photo for photo in photographs]
+def with_fisheyes(groups: Sequence[CameraGroup], numbers: Sequence[int]) -> list[CameraGroup]:
+    """The cameras in their order, those of these numbers (from 1) and their photographs with fisheyes."""
+    found = list(groups)
+    for number in numbers:
+        photographs = tuple(replace(photo, camera_model=FISHEYE) for photo in groups[number - 1].images)
+        found[number - 1] = replace(groups[number - 1], model=FISHEYE, images=photographs)
+    return found
 
 
 def read_found(workspace: Workspace, key: str) -> list[int]:

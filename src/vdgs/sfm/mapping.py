@@ -11,7 +11,7 @@ from rich.markup import escape
 from vdgs.errors import CaptureError
 from vdgs.sfm import fisheyes, global_mapper, incremental_mapper
 from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
-from vdgs.sfm.feature_extraction import CameraGroup, group_by_camera
+from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -35,10 +35,10 @@ def map_photographs(
         first, found = _find_fisheyes(plan, workspace, kinds, key, count, console)
     if not found:
         return _mapped_as_told(plan, workspace, kinds, key, count, console, first)
-    names = {photo.name for number in found for photo in kinds[number - 1].images}
-    photographs = fisheyes.with_fisheyes(plan.image_list.images, names)
-    plan = replace(plan, image_list=replace(plan.image_list, images=tuple(photographs)))
-    kinds = group_by_camera(photographs)
+    kinds = fisheyes.with_fisheyes(kinds, found)
+    bent = {photo.name: photo for kind in kinds for photo in kind.images}
+    photographs = tuple(bent.get(photo.name, photo) for photo in plan.image_list.images)
+    plan = replace(plan, image_list=replace(plan.image_list, images=photographs))
     fisheyes.use_lenses(workspace, kinds, key, plan.threads, console)
     return _mapped_as_told(plan, workspace, kinds, f"{key}, fisheyes", count, console)
 
