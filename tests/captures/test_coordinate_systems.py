@@ -16,7 +16,7 @@ PLACE = (-33.5, -70.6, 500.0)
 EASTING, NORTHING = 351375.7913, 6292135.2282  # of zone 19 south
 
 # PROJ looks seconds for the ways between heights, once in each process.
-pytestmark = pytest.mark.xdist_group("coordinate_systems")
+pytestmark = [pytest.mark.xdist_group("coordinate_systems"), pytest.mark.slow]
 
 
 @pytest.mark.parametrize(

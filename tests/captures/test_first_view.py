@@ -14,6 +14,8 @@ from vdgs.captures.first_view import FOV_DEG, DefaultView, default_view
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import look_at_pose
 
+pytestmark = pytest.mark.slow
+
 
 def oblique() -> Capture:
     """From the north-west alone, looking down by 45 degrees to the south-east."""

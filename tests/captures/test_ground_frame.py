@@ -25,6 +25,8 @@ from vdgs.geometry.geodesy import ecef_from_geodetic, enu_from_geodetic, geodeti
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.geometry.similarity import fit_similarity, fit_similarity_robust, geometric_median, rotation_to_z
 
+pytestmark = pytest.mark.slow
+
 ORIGIN = (46.8426, -91.994, 159.4)
 
 

@@ -15,6 +15,8 @@ from vdgs.captures.position_weights import agreed, are_told, relative_deviations
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.geodesy import geodetic_from_enu
 
+pytestmark = pytest.mark.slow
+
 AXES = np.array([1.0, 1.0, 2.0])
 COUNT = 48
 

@@ -28,6 +28,8 @@ from vdgs.sfm.source_images import SourceFile, SourceImages
 from vdgs.system.atomic_files import write_json
 from vdgs.system.similar_paths import suggest_path
 
+pytestmark = pytest.mark.slow
+
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy", "sklearn", "shapely", "rasterio", "PIL")
 #: A command line of each verb with an input that is mistyped: the folder `DCIM` or the run `flight`.
 MISTYPED = {

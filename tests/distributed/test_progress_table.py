@@ -13,6 +13,8 @@ from vdgs.distributed.resource_allocation import default_jobs
 from vdgs.distributed.shard_progress import ProgressStats, ShardProgress, read_progress_stats, seconds_left_overall
 from vdgs.distributed.task_process import error_message
 
+pytestmark = pytest.mark.slow
+
 
 @given(st.dictionaries(st.sampled_from(["iteration", "iterations", "psnr_training", "anchors", "seconds_left",
     "peak_memory_bytes"]), st.one_of(st.none(), st.booleans(), st.floats(), st.integers(), st.just(10**400),

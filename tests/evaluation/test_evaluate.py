@@ -24,7 +24,7 @@ from vdgs.evaluation.lpips import Lpips, LpipsScores
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings, ReferenceViews, RenderableModel
 from vdgs.system.atomic_files import to_jsonable, write_json
 
-pytestmark = pytest.mark.xdist_group("evaluate")
+pytestmark = [pytest.mark.xdist_group("evaluate"), pytest.mark.slow]
 
 NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
 

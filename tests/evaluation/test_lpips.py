@@ -16,7 +16,7 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation import lpips
 from vdgs.evaluation.lpips import Lpips, load_lpips
 
-pytestmark = pytest.mark.xdist_group("lpips")
+pytestmark = [pytest.mark.xdist_group("lpips"), pytest.mark.slow]
 
 #: VGG16 as published: channels of each convolution, M a 2 x 2 maximum.
 LAYOUT = [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512]

@@ -25,7 +25,7 @@ from vdgs.config.method import resolve_iterations
 from vdgs.config.presets import PRESETS
 from vdgs.errors import CaptureError, VdgsError
 
-pytestmark = pytest.mark.xdist_group("bench_custom_scenes")
+pytestmark = [pytest.mark.xdist_group("bench_custom_scenes"), pytest.mark.slow]
 
 PLAIN = CaptureOptions()
 

@@ -17,7 +17,7 @@ from support.bench import InThisProcess, benched, write_data
 from vdgs.errors import VdgsError
 from vdgs.evaluation import comparison_images
 
-pytestmark = pytest.mark.xdist_group("bench_renders")
+pytestmark = [pytest.mark.xdist_group("bench_renders"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

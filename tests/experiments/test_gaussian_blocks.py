@@ -30,7 +30,7 @@ from vdgs.errors import Stopped
 from vdgs.kernels import get_backend
 from vdgs.runs.stage_folder import StageFolder
 
-pytestmark = pytest.mark.xdist_group("gaussian_blocks")
+pytestmark = [pytest.mark.xdist_group("gaussian_blocks"), pytest.mark.slow]
 QUIET = Console(quiet=True)
 PLAIN_VASTGAUSSIAN = partial(train_vastgaussian, appearance=False)
 

@@ -29,7 +29,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 
-pytestmark = pytest.mark.xdist_group("gaussians")
+pytestmark = [pytest.mark.xdist_group("gaussians"), pytest.mark.slow]
 
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
 SHORT = Gs3dConfig(iterations=60, resolution_schedule=((0, 2), (30, 1)), density=DENSITY)

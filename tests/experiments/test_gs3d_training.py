@@ -38,7 +38,7 @@ from vdgs.kernels import cpu
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
 
-pytestmark = pytest.mark.xdist_group("gaussian_training")
+pytestmark = [pytest.mark.xdist_group("gaussian_training"), pytest.mark.slow]
 
 CONFIG = Gs3dConfig(
     iterations=80,

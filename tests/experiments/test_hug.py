@@ -24,7 +24,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json
 from vdgs.training import to_checkpoint, train_step
 
-pytestmark = pytest.mark.xdist_group("octree_gs")
+pytestmark = [pytest.mark.xdist_group("octree_gs"), pytest.mark.slow]
 QUIET = Console(quiet=True)
 
 

@@ -17,6 +17,8 @@ from vdgs.model.renderer import cull_anchors
 from vdgs.training import initial_state, to_checkpoint, train, view_at
 from vdgs.training.training_loop import downscale_at
 
+pytestmark = pytest.mark.slow
+
 PLAIN = replace(CONFIG, iterations=24, compensation=CompensationConfig(enabled=False))
 
 

@@ -31,6 +31,8 @@ from vdgs.model.decoder import Decoder
 from vdgs.model.gaussians import Gaussians, render_gaussians
 from vdgs.model.renderer import decode_view, render
 
+pytestmark = pytest.mark.slow
+
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]
 
 

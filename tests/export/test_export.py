@@ -42,6 +42,8 @@ from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.atomic_files import read_json
 from vdgs.visibility.visibility_counts import count_visibility
 
+pytestmark = pytest.mark.slow
+
 #: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
 PLACE = (46.95, 7.44, 560.0)
 QUIET = Console(quiet=True)

@@ -27,7 +27,7 @@ from vdgs.config.validation_rules import checked_settings
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.model.anchor_model import AnchorModel
 
-pytestmark = pytest.mark.xdist_group("api")
+pytestmark = [pytest.mark.xdist_group("api"), pytest.mark.slow]
 STUB = Path(vdgs.__file__).with_suffix(".pyi")
 LAZY = "vdgs.system.lazy_package"
 

@@ -20,6 +20,8 @@ from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks
 from vdgs.partition.boundary import alpha_shape, expand_core
 from vdgs.partition.partition_scene import partition_scene
 
+pytestmark = pytest.mark.slow
+
 
 def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Anchors of an uneven oblong site, and V that falls off from its middle."""

@@ -24,6 +24,8 @@ from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_folder import RunFolder
 
+pytestmark = pytest.mark.slow
+
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=16).filter(any)
 
 

@@ -45,6 +45,8 @@ from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.quoting import shell_word
 from vdgs.system.tensors import file_id, read_tensors, write_tensors
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = [
     camera_at(x, y, 5.0, 15.0, 90.0 * number) for number, (x, y) in enumerate([(-2, -2), (2, -2), (2, 2), (-2, 2)])
 ]

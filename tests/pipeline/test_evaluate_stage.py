@@ -19,6 +19,8 @@ from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.run_context import RunContext
 from vdgs.system.atomic_files import read_json
 
+pytestmark = pytest.mark.slow
+
 QUIET = Console(quiet=True)
 
 

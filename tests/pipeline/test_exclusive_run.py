@@ -45,6 +45,8 @@ from vdgs.sfm.reconstruct import writing
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import is_locked
 
+pytestmark = pytest.mark.slow
+
 #: Another process that drives a run: it holds the lock of which it is told until its input ends.
 DRIVER = (
     "import fcntl, sys; lock = open(sys.argv[1], 'a'); fcntl.flock(lock, fcntl.LOCK_EX); print(flush=True); "

@@ -37,6 +37,8 @@ from vdgs.runs.run_status import get_run_status
 from vdgs.runs.stage_keys import stage_keys
 from vdgs.system.processor_time import Cost
 
+pytestmark = pytest.mark.slow
+
 BOX = np.s_[18:30, 20:44]
 
 

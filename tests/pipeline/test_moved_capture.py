@@ -34,7 +34,7 @@ from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.visibility_store import get_run_visibility
 from vdgs.system.quoting import shell_line
 
-pytestmark = pytest.mark.xdist_group("moved_capture")
+pytestmark = [pytest.mark.xdist_group("moved_capture"), pytest.mark.slow]
 
 METHOD = MethodConfig(TrainConfig(iterations=3, model=ModelConfig(num_offsets=2)))
 UP = CaptureOptions(up="z")

@@ -41,6 +41,8 @@ from vdgs.rendering.ortho.tile_renderer import (
 )
 from vdgs.visibility.visibility_counts import count_visibility
 
+pytestmark = pytest.mark.slow
+
 rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
 

@@ -20,6 +20,8 @@ from vdgs.rendering.ortho import detail_transfer
 from vdgs.rendering.ortho.detail_transfer import DetailTransfer
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("pyproj")
 
 

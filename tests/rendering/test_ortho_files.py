@@ -23,6 +23,8 @@ from vdgs.rendering.ortho.ortho_plan import OrthoPlan
 from vdgs.runs.open_run import ModelLocation
 from vdgs.runs.run_context import RunContext
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
 

@@ -25,6 +25,8 @@ from vdgs.report.capture_stats import measure_capture
 from vdgs.system.units import format_length
 from vdgs.visibility.visibility_counts import count_visibility, visibility_stats
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def capture(tmp_path):

@@ -40,6 +40,8 @@ from vdgs.system.quoting import shell_line, shell_word
 from vdgs.system.step_progress import StepRecord, read_step
 from vdgs.system.tensors import file_id
 
+pytestmark = pytest.mark.slow
+
 PLACES = [[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
 COMMAND = "vdgs run here --output there"
 

@@ -31,6 +31,8 @@ from vdgs.sfm.image_metadata import (
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.system.lazy_pycolmap import pycolmap
 
+pytestmark = pytest.mark.slow
+
 PIX4D = "Camera:Yaw", "Camera:Pitch", "Camera:Roll"
 SENSEFLY = "sensefly:Heading", "sensefly:PitchAngle", "sensefly:RollAngle"
 DJI = "drone-dji:GimbalYawDegree", "drone-dji:GimbalPitchDegree", "drone-dji:GimbalRollDegree"

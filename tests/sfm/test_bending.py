@@ -25,6 +25,8 @@ from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.scale_bars import ScaleBars, known_scale
 from vdgs.system.lazy_pycolmap import pycolmap
 
+pytestmark = pytest.mark.slow
+
 
 def priors(enu: np.ndarray, std: float, are_stated: bool) -> GpsPriors:
     count = len(enu)

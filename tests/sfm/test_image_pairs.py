@@ -8,6 +8,8 @@ from scipy.spatial import cKDTree
 
 from vdgs.sfm.pair_selection import SHARED_NEIGHBOR_FACTOR, spatial_pairs
 
+pytestmark = pytest.mark.slow
+
 NEIGHBORS = 16
 
 

@@ -21,6 +21,8 @@ from vdgs.sfm.feature_extraction import create_database, group_by_camera
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.workspace import Workspace, silence_colmap
 
+pytestmark = pytest.mark.slow
+
 CONSOLE = Console(file=io.StringIO())
 #: The second camera from the first: 5 m to the left, turned by 20 degrees about the right vector.
 TURN = np.radians(20)

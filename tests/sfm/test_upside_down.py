@@ -21,6 +21,8 @@ from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.up_direction import model_points, up_of
 
+pytestmark = pytest.mark.slow
+
 
 def up_of_an_arc(recorded_pitch_deg: float) -> tuple[Up, list[str]]:
     """18 photographs on an arc of 85 degrees about a building, 20 degrees down, and the gimbal's angles."""

@@ -16,6 +16,8 @@ from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.up_direction import up_of
 
+pytestmark = pytest.mark.slow
+
 #: The model's world is turned from east, north, up.
 TURN = Rotation.random(random_state=3).as_matrix()
 

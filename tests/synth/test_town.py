@@ -42,7 +42,7 @@ from vdgs.synth.streets import make_street_plan
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.zones import LandUse
 
-pytestmark = pytest.mark.xdist_group("synth")
+pytestmark = [pytest.mark.xdist_group("synth"), pytest.mark.slow]
 
 TINY = SynthOptions(
     seed=3, num_images=6, num_test_images=2, num_validation_images=1, width=96, height=72, extent_m=50.0,

@@ -30,6 +30,8 @@ from vdgs.training import TrainingProblem, train
 from vdgs.training.target import background_at
 from vdgs.visibility.frustum import project_points
 
+pytestmark = pytest.mark.slow
+
 FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
 
 

@@ -23,7 +23,7 @@ from vdgs.training.crops import Crop, crop_at
 from vdgs.training.optimizer import learning_rates_at
 from vdgs.training.training_step import step_unseen_anchors
 
-pytestmark = pytest.mark.xdist_group("training")
+pytestmark = [pytest.mark.xdist_group("training"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
