@@ -52,6 +52,8 @@ def lens_of(common: dict, frame: dict | None = None) -> Intrinsics:
         ({"distortion_model": "inverse_brown_conrady", "distortion": [0, 0, 0, 0, 0]}, PINHOLE),
         ({"distortion_model": "none", "distortion": "none", "distortion_params": None, "xi": 0}, PINHOLE),
         ({"distortion_map": "", "undistorted": True, "is_distorted": False, "radius": 2.5}, PINHOLE),
+        ({"distortion_score": 0.3, "distortion_applied": 1, "fisheye_fov": 190.0}, PINHOLE),
+        ({"camera": {"camera_model": "iPhone 14 Pro"}}, PINHOLE),
         ({"lens_model": "Hasselblad L2D-20c", "lens": "24 mm", "dist": [1.0, 2.0], "camera": {"fov": 84}}, PINHOLE),
     ],
 )

@@ -58,6 +58,8 @@ _SAME = {"f": "fl_", "c": "c", "p": "c"}
 _DEGREES = {"x_fov": "camera_angle_x", "y_fov": "camera_angle_y"}
 #: Names of distortion that are not known, and names of what else may be a part of a lens.
 _BENDS = re.compile(r"(?<!un)distort|dist_?coef|radial|tangential|thin_?prism|fisheye|^xi$|omnidir", re.IGNORECASE)
+#: What else is said of distortion, or of a lens that bends: no coefficients.
+_ABOUT = re.compile(r"score|error|rms|appl|enabled|correct|fov|field_?of_?view|version|count|num_", re.IGNORECASE)
 _OF_A_LENS = re.compile(
     r"^(cameras|lens(es)?|focals?)$|intrins|calib|camera_?(mat|info|param)|lens_?param|fov|field_?of_?view|focal_?len",
     re.IGNORECASE,
@@ -76,8 +78,11 @@ _ONES: dict[int, tuple[int, ...]] = {4: (), 9: (8,), 12: (10,), 16: (10, 15)}
 
 
 def with_nested_model(values: Mapping[str, Any]) -> JsonObject:
-    """The values, with a camera model that only an object in them has."""
-    inner = [{key: each[key] for key in ("camera_model", "is_fisheye") if key in each} for each in _objects(values)]
+    """The values, with a camera model that only an object in them has, and that is no name of a shop: with blanks."""
+    inner = [
+        {key: each[key] for key in ("camera_model", "is_fisheye") if key in each and " " not in str(each[key]).strip()}
+        for each in _objects(values)
+    ]
     return {key: value for each in [*inner, values] for key, value in each.items() if value is not None}
 
 
@@ -293,7 +298,7 @@ def _kind(key: str) -> _Kind | None:
     if key.lower() in LENS:  # in capitals
         return "term"
     kind = next((kind for kind, names in _KINDS.items() if _plain(key) in names), None)
-    return kind or ("bends" if _BENDS.search(key) else None)
+    return kind or ("bends" if _BENDS.search(key) and not _ABOUT.search(key) else None)
 
 
 @lru_cache(maxsize=1024)
