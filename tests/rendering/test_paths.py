@@ -475,6 +475,13 @@ def test_films_look_at_what_photographs_converge_on_from_as_far_as_they_were(mad
         assert 63 < depth[0] < 73
 
 
+def test_an_orbit_is_as_wide_as_most_cameras_are_away_where_some_look_at_the_place_on_their_way():
+    on_their_way = [standing([60 + 30 * k, 0, 60], [0, 0, 17]) for k in range(1, 7)]
+    path = orbit(np.zeros((1, 3)), rings() + on_their_way, TEMPLATE, seconds=2.0, fps=10.0)
+    away = [np.hypot(*camera.position[:2]) for camera in path.cameras]
+    assert path.converged is not None and 50 < min(away) <= max(away) < 100
+
+
 def test_a_survey_has_no_place_that_films_look_at():
     assert flyover(strips(), TEMPLATE, seconds=0.2).converged is None
     assert orbit(np.zeros((1, 3)), strips(), TEMPLATE, seconds=0.2).converged is None

@@ -19,6 +19,8 @@ DEFAULT_SECONDS = 12.0
 FLYOVER_TILT_DEG = 20.0
 #: Cameras of the flight that a flyover keeps at most; more would not be seen through the smoothing.
 _MAX_TRACK_CAMERAS = 400
+#: An orbit about a place is no wider than so many times the median distance of those that look at it (choice).
+MOST_OF_MEDIAN = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,8 @@ def orbit(
     axes = np.linalg.svd(offsets, full_matrices=False)[2] if len(offsets) > 1 else np.eye(2)
     reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
     radii = np.maximum(share * reach, 0.25 * abs(height))
+    if converged is not None:  # some may have looked there on their way
+        radii = np.minimum(radii, MOST_OF_MEDIAN * float(np.median(np.linalg.norm(offsets, axis=1))))
     angles = np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False)
     offsets = ((radii * [np.cos(angle), np.sin(angle)]) @ axes for angle in angles)
     poses = (look_at_pose(center + np.append(offset, height), center) for offset in offsets)
