@@ -479,7 +479,8 @@ def test_an_orbit_is_as_wide_as_most_cameras_are_away_where_some_look_at_the_pla
     on_their_way = [standing([60 + 30 * k, 0, 60], [0, 0, 17]) for k in range(1, 7)]
     path = orbit(np.zeros((1, 3)), rings() + on_their_way, TEMPLATE, seconds=2.0, fps=10.0)
     away = [np.hypot(*camera.position[:2]) for camera in path.cameras]
-    assert path.converged is not None and 50 < min(away) <= max(away) < 100
+    assert path.converged is not None
+    assert 50 < min(away) <= max(away) < 100
 
 
 def test_a_survey_has_no_place_that_films_look_at():

@@ -91,6 +91,19 @@ def test_snow_before_a_white_sky_with_points_here_and_there_is_no_sky() -> None:
     assert found.sky_at(CAMERA).numpy()[snow].mean() < 0.2
 
 
+def test_snow_that_is_plainly_darker_than_the_sky_is_no_opening_though_it_has_no_points() -> None:
+    up = ray_directions(CAMERA)[..., 2].numpy()
+    snow = (up > 0) & (up < math.sin(math.radians(8)))
+    noise = np.random.default_rng(1).normal(0, 1, (*up.shape, 3))
+    image = np.where(snow, 232, np.where(up > 0, 252, 90))[..., None] + noise
+    x = np.linspace(-100, 100, 1600)
+    ridge = np.column_stack([x, np.full(1600, 100.0), 12 + np.hypot(x, 100) * np.tan(np.radians(8.0))])
+    skyline, white = find_skyline(CAMERA.position, ridge), torch.full((64, 256, 3), 252 / 255)
+    found = find_sky_mask(torch.from_numpy(image.clip(0, 255).astype(np.uint8)), CAMERA, skyline, white, ridge)
+    assert found is not None
+    assert found.sky_at(CAMERA).numpy()[snow].mean() < 0.2
+
+
 def test_no_ground_is_empty_sky() -> None:
     """Water and fog below the horizon that look like sky: the map may be behind them, but they may be solid."""
     gray = torch.from_numpy(np.full((240, 320, 3), [int(255 * c) for c in SKY], np.uint8))

@@ -24,6 +24,8 @@ from vdgs.model.initialization.sky import LOWEST_ELEVATION, MIN_POINTS, PLAIN_EL
 MAX_SIDE_PX = 1024
 #: Sky differs from the environment map, in the photograph's own brightness, by at most so much in any channel (choice).
 MAX_DIFFERENCE = 0.1
+#: Sky apart from the sky above the skyline differs by at most so much in the mean: more is a pale wall (choice).
+MAX_OPENING_DIFFERENCE = 0.04
 #: Sky changes by at most so much within 3 x 3 pixels, blurred by one pixel: a cable changes more (choice).
 MAX_CHANGE = 0.03
 #: The borders of objects are not smooth: pixels of the sky's color up to so far from smooth sky are sky (choice).
@@ -98,14 +100,17 @@ def find_sky_mask(
     apart = pixels - _sky_colors(envmap, directions)
     if (above & smooth).any():  # the photograph's own brightness
         apart -= np.median(apart[above & smooth], axis=0)
-    alike = (np.abs(apart).max(axis=2) <= MAX_DIFFERENCE) & (up > math.sin(PLAIN_ELEVATION))
+    difference = np.abs(apart).max(axis=2)
+    alike = (difference <= MAX_DIFFERENCE) & (up > math.sin(PLAIN_ELEVATION))
     shown = _shown_points(points, camera)
     alike &= ~_shows_points(shown)
     count, parts = cv2.connectedComponents((alike & smooth).astype(np.uint8), connectivity=4)
     grows = np.bincount(parts[above & smooth], minlength=count) > 0
     opens = np.bincount(parts[up > 0], minlength=count) > 0
     # What shows below a bridge or through a frame.
-    opens &= np.bincount(parts.ravel(), minlength=count) >= MIN_APERTURE * parts.size
+    sizes = np.bincount(parts.ravel(), minlength=count)
+    opens &= sizes >= MIN_APERTURE * parts.size
+    opens &= np.bincount(parts.ravel(), difference.ravel(), minlength=count) <= MAX_OPENING_DIFFERENCE * sizes
     # A white wall or snow before a white sky has points here and there; those at outlines are of what stands there.
     deep = cv2.erode((parts > 0).astype(np.uint8), np.ones((2 * CLUSTER_PX + 1,) * 2, np.uint8)) * shown
     opens &= np.bincount(parts.ravel(), deep.ravel(), minlength=count) < MIN_POINTS
