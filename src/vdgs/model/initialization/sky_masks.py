@@ -25,7 +25,7 @@ MAX_SIDE_PX = 1024
 #: Sky differs from the environment map, in the photograph's own brightness, by at most so much in any channel (choice).
 MAX_DIFFERENCE = 0.1
 #: Sky apart from the sky above the skyline differs by at most so much in the mean: more is a pale wall (choice).
-MAX_OPENING_DIFFERENCE = 0.04
+MAX_OPENING_DIFFERENCE = 0.06
 #: Sky changes by at most so much within 3 x 3 pixels, blurred by one pixel: a cable changes more (choice).
 MAX_CHANGE = 0.03
 #: The borders of objects are not smooth: pixels of the sky's color up to so far from smooth sky are sky (choice).
