@@ -27,6 +27,7 @@ from support.metashape_files import (
     metashape_rig,
     metashape_transform,
     metashape_xml,
+    read_export,
     write_project,
 )
 from support.true_flight import (
@@ -40,7 +41,7 @@ from support.true_flight import (
     words,
 )
 from vdgs.captures.formats.lens_projection import pixel_rays, ray_pixels
-from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture
+from vdgs.captures.formats.source_capture import NoTiePoints
 from vdgs.captures.formats.xml_documents import read_xml
 from vdgs.captures.loading import read_files
 from vdgs.captures.project_formats import read_project
@@ -51,20 +52,13 @@ from vdgs.geometry.geodesy import ecef_from_geodetic, enu_from_geodetic, geodeti
 OPTIONS = CaptureOptions()
 
 
-def read(root: Path, xml: str, flight: TrueFlight, options: CaptureOptions = OPTIONS) -> SourceCapture:
-    """The export beside the photographs, read without points."""
-    flight.touch(root)
-    (root / "cameras.xml").write_text(xml, encoding="utf-8")
-    return read_project(root, "metashape", options, needs_points=False)
-
-
 @pytest.mark.parametrize(
     "lens",
     [Lens(), Lens(b1=0, b2=0, k=(-0.1, 0.02, -0.01, 0)), Lens(k=(0, 0, 0, 0), p=(0, 0)), Lens(growth=(0.4, -0.2))],
 )
 def test_a_georeferenced_chunk_is_read_exactly(tmp_path, lens):
     flight = true_flight(lens=lens)
-    source = read(tmp_path, metashape_xml(flight), flight)
+    source = read_export(tmp_path, metashape_xml(flight), flight)
     assert_true(source, flight)
     assert source.georef.method == "Metashape, WGS 84"
     assert source.original_images
@@ -75,7 +69,7 @@ def test_the_transform_of_old_files_is_one_matrix(tmp_path):
     flight, matrix = true_flight(), np.eye(4)
     matrix[:3] = np.column_stack([CHUNK_SCALE * CHUNK_ROTATION, CHUNK_ORIGIN])
     xml = metashape_xml(flight, reference=LOCAL, transform=f"<transform>{words(matrix)}</transform>")
-    assert_true(read(tmp_path, xml, flight), flight)
+    assert_true(read_export(tmp_path, xml, flight), flight)
 
 
 def test_a_projected_system_of_the_chunk_does_not_matter_for_its_place(tmp_path):
@@ -83,71 +77,35 @@ def test_a_projected_system_of_the_chunk_does_not_matter_for_its_place(tmp_path)
 
     flight = true_flight()
     wkt = pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL")
-    assert_true(read(tmp_path, metashape_xml(flight, reference=wkt), flight), flight)
+    assert_true(read_export(tmp_path, metashape_xml(flight, reference=wkt), flight), flight)
 
 
 def test_cameras_that_name_no_component_are_of_the_only_one(tmp_path):
     flight = true_flight()
     cameras = metashape_cameras(flight, 'sensor_id="0"')
-    assert_true(read(tmp_path, metashape_xml(flight, cameras=cameras), flight), flight)
+    assert_true(read_export(tmp_path, metashape_xml(flight, cameras=cameras), flight), flight)
 
 
 def test_a_system_that_nobody_knows_is_named_and_strict_refuses(tmp_path):
     """The transform is Earth-centred in whichever datum: the place is that of WGS 84, or there is none."""
     flight = true_flight()
     xml = metashape_xml(flight).replace("GEOGCS[&quot;WGS 84", "BOGUS[").replace('GEOGCS["WGS 84"', 'BOGUS["Site 7"')
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     assert_true(source, flight)
     assert any('\'BOGUS["Site 7"' in each and "is not known" in each for each in source.warnings)
     with pytest.raises(CaptureError, match=r"Site 7.* is not known.*EPSG.*--strict"):
-        read(tmp_path, xml, flight, CaptureOptions(strict=True))
+        read_export(tmp_path, xml, flight, CaptureOptions(strict=True))
     local = metashape_xml(flight, reference=LOCAL).replace("LOCAL_CS", "BOGUS")
-    source = read(tmp_path, local, flight)
+    source = read_export(tmp_path, local, flight)
     assert_true(source, flight)
     assert source.georef.origin is None
 
 
 def test_local_coordinates_are_metres_with_z_up(tmp_path):
     flight = true_flight()
-    source = read(tmp_path, metashape_xml(flight, reference=LOCAL), flight)
+    source = read_export(tmp_path, metashape_xml(flight, reference=LOCAL), flight)
     assert_true(source, flight)
     assert source.georef.origin is None
-
-
-def with_markers(flight: TrueFlight, off: tuple[float, float, float]) -> str:
-    """An export with three markers, of which the chunk's transform is off by metres east, north and up, and one that
-    was not surveyed."""
-    shown = [dict(zip(numbers.tolist(), pixels, strict=True)) for pixels, numbers in map(flight.pixels, range(8))]
-    often = sorted(range(len(flight.points)), key=lambda k: -sum(k in each for each in shown))[:3]
-    surveyed = geodetic_from_enu(flight.points[often] - off, ORIGIN).tolist()
-    listed, marked = '<marker id="9" label="target 9"/>', ""
-    for k, (latitude, longitude, height) in zip(often, surveyed, strict=True):
-        place = f'x="{longitude!r}" y="{latitude!r}" z="{height!r}"'
-        listed += f'<marker id="{k}" label="m{k}"><reference {place}/></marker>'
-        marks = [(camera, *each[k]) for camera, each in enumerate(shown) if k in each]
-        marks = [f'<location camera_id="{n}" pinned="true" x="{x:.4f}" y="{y:.4f}"/>' for n, x, y in marks]
-        guess = '<location camera_id="0" pinned="false" x="3" y="3"/>'
-        marked += f'<marker marker_id="{k}">{guess}{"".join(marks)}</marker>'
-    whole = metashape_xml(flight).replace("<frames ", f"<markers>{listed}</markers><frames ")
-    cameras = '<cameras><camera camera_id="0"/></cameras>'
-    return whole.replace("<markers/>", f"{cameras}<markers>{marked}</markers>")
-
-
-@pytest.mark.parametrize(
-    ("off", "said"),
-    [
-        ((0.0, 0, 0), "its poses agree with 3 of them"),
-        ((3.0, -2, 30), "put them 3.00 m east, 2.00 m south and 30.00 m above"),
-    ],
-)
-def test_markers_are_compared_with_the_poses(tmp_path, off, said):
-    flight = true_flight()
-    source = read(tmp_path, with_markers(flight, off), flight)
-    assert_true(source, flight)
-    note = next(each for each in source.warnings if "markers" in each)
-    assert note.startswith("3 markers with surveyed places are in the project and not used")
-    assert said in note
-    assert ("Update Transform" in note) == any(off)
 
 
 FEET = 'LOCAL_CS["Local Coordinates (ft)",LOCAL_DATUM["Local Datum",0],UNIT["US survey foot",0.304800609601219]]'
@@ -166,7 +124,7 @@ def test_local_coordinates_in_feet_are_metres_by_what_references_show(tmp_path, 
         scale, translation = (re.search(f"<{name} .*?>(.*?)</{name}>", xml)[1] for name in ("scale", "translation"))
         xml = xml.replace(translation, words(np.fromstring(translation, sep=" ") / feet), 1)
         xml = xml.replace(f">{scale}<", f">{float(scale) / feet!r}<", 1)
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     assert_true(source, flight)
     (said,) = (each for each in source.warnings if "US survey foot" in each)
     assert ("taken as US survey foot" in said) == bool(poses_in_feet)
@@ -177,7 +135,7 @@ def test_local_coordinates_in_feet_are_metres_by_what_references_show(tmp_path, 
 def test_references_of_another_size_show_nothing_of_a_unit(tmp_path, unit):
     flight = true_flight()
     xml = metashape_xml(flight, reference=unit, transform=metashape_transform(LOCAL))
-    source = read(tmp_path, xml, flight)  # its references are degrees
+    source = read_export(tmp_path, xml, flight)  # its references are degrees
     assert_true(source, flight)
     assert not any("references of its cameras show" in each for each in source.warnings)
 
@@ -195,7 +153,7 @@ def test_exports_in_other_encodings(tmp_path, encoding):
 
 def test_a_chunk_without_transform_has_the_shape_alone(tmp_path):
     flight = true_flight()
-    source = read(tmp_path, metashape_xml(flight, transform=""), flight)
+    source = read_export(tmp_path, metashape_xml(flight, transform=""), flight)
     assert source.georef is None
     scaled = replace(flight, centers=chunk_from_enu(flight.centers))
     views = {view.name: view.camera_from_world for view in source.views}
@@ -218,7 +176,7 @@ def test_older_files_have_the_transform_in_the_chunk_and_their_own_lens(tmp_path
     )
     xml = metashape_xml(flight, sensors=sensors, cameras=metashape_cameras(flight, 'sensor_id="0"'), transform="")
     xml = xml.replace("<reference>", f"{metashape_transform(WGS84)}<reference>")
-    assert_true(read(tmp_path, xml, flight), flight)
+    assert_true(read_export(tmp_path, xml, flight), flight)
 
 
 def test_several_sensors_and_labels_of_one_name_are_told_apart_by_groups(tmp_path):
@@ -235,7 +193,7 @@ def test_several_sensors_and_labels_of_one_name_are_told_apart_by_groups(tmp_pat
     xml = metashape_xml(
         flight, sensors=sensors, cameras=head + '<group id="1"' + tail.replace('sensor_id="0"', 'sensor_id="1"')
     )
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     for half, lens in ((0, flight.lens), (4, second)):
         part = TrueFlight(
             names[half : half + 4],
@@ -254,7 +212,7 @@ def test_a_camera_of_no_use_is_named_and_left_out(tmp_path):
         '<camera id="92" sensor_id="0" enabled="false" label="switched_off"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1'
         '</transform></camera><camera id="93" sensor_id="0" master_id="0" label="slave"/>'
     )
-    source = read(tmp_path, metashape_xml(flight, cameras=metashape_cameras(flight) + extra), flight)
+    source = read_export(tmp_path, metashape_xml(flight, cameras=metashape_cameras(flight) + extra), flight)
     assert_true(source, flight)
     said = " ".join(source.warnings)
     assert "2 cameras are not aligned and are left out (unaligned_1, unaligned_2)" in said
@@ -268,7 +226,7 @@ def test_fisheyes_are_read_as_the_program_describes_them(tmp_path, kind, b2, p):
     lens = Lens(b2=b2, k=(0.02, -0.01, 0.003, -0.001), p=p)
     flight = true_flight(lens=lens)
     sensors = f'<sensor id="0" label="fish" type="{kind}">{metashape_calibration(lens, kind=kind)}</sensor>'
-    intrinsics = read(tmp_path, metashape_xml(flight, sensors=sensors), flight).views[0].intrinsics
+    intrinsics = read_export(tmp_path, metashape_xml(flight, sensors=sensors), flight).views[0].intrinsics
     rays = np.array([[0.5, 0.3], [-0.9, 0.1], [0.0, -1.4]])
     radius = np.hypot(*rays.T)
     angles = np.arctan(radius) if kind == "fisheye" else 2 * np.sin(np.arctan(radius) / 2)
@@ -281,11 +239,11 @@ def test_slaves_are_where_their_masters_and_sensors_say(tmp_path):
     flight = true_flight()
     xml, slaves = metashape_rig(flight, Lens(f=2900.0, cx=4.0))
     slaves.touch(tmp_path)
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     for part in (flight, slaves):
         assert_true(replace(source, views=tuple(view for view in source.views if view.name in part.names)), part)
     xml, _ = metashape_rig(flight, Lens(), bands="NIR")
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     assert_true(source, flight)
     assert any("8 cameras show other bands than the masters" in each for each in source.warnings)
 
@@ -295,7 +253,7 @@ def test_what_a_lens_has_besides_is_said(tmp_path):
     more = '<property name="rolling_shutter" value="true"/><calibration class="adjusted"><corrections type="fourier"/>'
     xml = metashape_xml(flight).replace('<property name="layer_index" value="0"/>', "")
     xml = xml.replace('<calibration type="frame" class="adjusted">', more)
-    said = " ".join(read(tmp_path, xml, flight).warnings)
+    said = " ".join(read_export(tmp_path, xml, flight).warnings)
     assert "rolling shutter is not modelled" in said
     assert "additional corrections of its lens are not applied" in said
 
@@ -303,7 +261,7 @@ def test_what_a_lens_has_besides_is_said(tmp_path):
 def test_a_camera_whose_transform_is_zeros_is_named_and_the_others_are_used(tmp_path):
     flight = true_flight()
     zeros = f'<camera id="90" sensor_id="0" label="DJI_9"><transform>{"0 " * 16}</transform></camera>'
-    source = read(tmp_path, metashape_xml(flight, cameras=metashape_cameras(flight) + zeros), flight)
+    source = read_export(tmp_path, metashape_xml(flight, cameras=metashape_cameras(flight) + zeros), flight)
     assert_true(source, flight)
     assert any("all zeros" in each and "(DJI_9)" in each for each in source.warnings)
 
@@ -381,7 +339,7 @@ def test_a_project_that_is_not_whole_says_what_to_copy(tmp_path):
 def test_lenses_that_are_not_read_are_named(tmp_path, sensors, says):
     flight = true_flight()
     with pytest.raises(CaptureError, match=f"(?s)8 of its 8 cameras cannot be used.*{says}.*DJI_0000, DJI_0001"):
-        read(tmp_path, metashape_xml(flight, sensors=sensors), flight)
+        read_export(tmp_path, metashape_xml(flight, sensors=sensors), flight)
 
 
 def test_a_sensor_without_calibration_is_named_and_the_others_are_used(tmp_path):
@@ -392,21 +350,21 @@ def test_a_sensor_without_calibration_is_named_and_the_others_are_used(tmp_path)
     cut = cameras.index('<camera id="6"')
     cameras = cameras[:cut] + cameras[cut:].replace('sensor_id="0"', 'sensor_id="1"')
     xml = metashape_xml(flight, sensors=sensors, cameras=cameras)
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     assert_true(source, replace(flight, names=flight.names[:6]))
     [said] = [each for each in source.warnings if "cannot be used" in each]
     assert "2 of 8 cameras" in said
     assert "sensor 1 (thermal) has no calibration" in said
     assert "(DJI_0006, DJI_0007)" in said
     with pytest.raises(CaptureError, match=r"(?s)2 of its 8 cameras.*--strict.*thermal.*DJI_0006, DJI_0007"):
-        read(tmp_path, xml, flight, CaptureOptions(strict=True))
+        read_export(tmp_path, xml, flight, CaptureOptions(strict=True))
 
 
 def test_a_chunk_whose_cameras_are_all_disabled_has_none(tmp_path):
     flight = true_flight()
     cameras = metashape_cameras(flight).replace("<camera ", '<camera enabled="false" ')
     with pytest.raises(CaptureError, match="no camera of it has a pose"):
-        read(tmp_path, metashape_xml(flight, cameras=cameras), flight)
+        read_export(tmp_path, metashape_xml(flight, cameras=cameras), flight)
 
 
 def test_the_adjusted_calibration_is_used_and_the_initial_one_where_there_is_no_other(tmp_path):
@@ -414,7 +372,7 @@ def test_the_adjusted_calibration_is_used_and_the_initial_one_where_there_is_no_
     first, second = metashape_calibration(Lens(f=3000.0), which=INITIAL), metashape_calibration(flight.lens)
     for text in (first + second, second + first, metashape_calibration(flight.lens, which=INITIAL)):
         sensors = f'<sensor id="0" label="x" type="frame">{text}</sensor>'
-        assert_true(read(tmp_path, metashape_xml(flight, sensors=sensors), flight), flight)
+        assert_true(read_export(tmp_path, metashape_xml(flight, sensors=sensors), flight), flight)
 
 
 def test_chunks(tmp_path):
@@ -425,9 +383,9 @@ def test_chunks(tmp_path):
     empty = '<chunk label="other" enabled="true"><sensors/><cameras/></chunk>'
     off = chunk.replace('enabled="true"', 'enabled="false"', 1)
     for others in (empty, off):
-        assert_true(read(tmp_path, xml[:start] + others + xml[start:], flight), flight)
+        assert_true(read_export(tmp_path, xml[:start] + others + xml[start:], flight), flight)
     with pytest.raises(CaptureError, match="2 chunks have cameras"):
-        read(tmp_path, xml[:start] + chunk + xml[start:], flight)
+        read_export(tmp_path, xml[:start] + chunk + xml[start:], flight)
     (tmp_path / "empty.xml").write_text(xml[:start] + empty + xml[end:])
     with pytest.raises(CaptureError, match="no camera of it has a pose"):
         read_project(tmp_path / "empty.xml", "metashape", OPTIONS)
@@ -438,7 +396,7 @@ def test_components_without_a_common_world_leave_the_smaller_out(tmp_path):
     cameras = metashape_cameras(flight)
     cut = cameras.index('<camera id="6"')
     cameras = cameras[:cut] + cameras[cut:].replace('component_id="0"', 'component_id="1"')
-    source = read(tmp_path, metashape_xml(flight, cameras=cameras), flight)
+    source = read_export(tmp_path, metashape_xml(flight, cameras=cameras), flight)
     kept = TrueFlight(flight.names[:6], flight.rotations[:6], flight.centers[:6], flight.points, flight.lens)
     assert_true(source, kept)
     assert any("2 cameras of other components" in each for each in source.warnings)
@@ -480,7 +438,7 @@ def test_names_that_may_be_of_two_photographs_are_none(tmp_path):
     (tmp_path / "copy" / "DJI_0001.JPG").parent.mkdir()
     (tmp_path / "copy" / "DJI_0001.JPG").touch()
     xml = metashape_xml(flight).replace('label="100MEDIA"', 'label="Group 1"')
-    source = read(tmp_path, xml, flight)
+    source = read_export(tmp_path, xml, flight)
     assert any("may be of several photographs" in each and "DJI_0001" in each for each in source.warnings)
     assert not next(view for view in source.views if "DJI_0001" in view.name).image_path.is_file()
 
@@ -503,11 +461,11 @@ def test_of_two_photographs_the_one_as_large_as_the_camera_is_taken(tmp_path, co
     with pytest.raises(
         CaptureError, match=rf"8 of its 8 names .*: DCIM\S* or \S*{re.escape(copied[1])}.*Of these {remedy}"
     ):
-        read(tmp_path, metashape_xml(flight), flight)
+        read_export(tmp_path, metashape_xml(flight), flight)
     Image.new("L", SIZE).save(tmp_path / flight.names[0])
     for name in flight.names[1:]:
         (tmp_path / name).write_bytes((tmp_path / flight.names[0]).read_bytes())
-    source = read(tmp_path, metashape_xml(flight), flight)
+    source = read_export(tmp_path, metashape_xml(flight), flight)
     assert {view.name for view in source.views} == {*flight.names}
     assert any("8 names of the project may be of several" in each for each in source.warnings)
 
@@ -521,7 +479,9 @@ def test_a_point_cloud_beside_is_used_in_whichever_coordinates_it_is(tmp_path, f
 
     flight = true_flight()
     geodetic = geodetic_from_enu(flight.points, ORIGIN)
-    source = read(tmp_path, metashape_xml(flight, reference=pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL")), flight)
+    source = read_export(
+        tmp_path, metashape_xml(flight, reference=pyproj.CRS("EPSG:32632").to_wkt("WKT1_GDAL")), flight
+    )
     utm = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform(
         geodetic[:, 1], geodetic[:, 0]
     )

@@ -8,6 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from support.true_flight import ORIGIN, Lens, TrueFlight, omega_phi_kappa, words
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.project_formats import read_project
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 
 WGS84 = (
@@ -85,6 +88,13 @@ def metashape_xml(
         f"<reference>{reference.replace('&', '&amp;')}</reference><region><center>0 0 0</center></region>"
         '<frames next_id="1"><frame id="0"><markers/></frame></frames></chunk></document>'
     )
+
+
+def read_export(root: Path, xml: str, flight: TrueFlight, options: CaptureOptions | None = None) -> SourceCapture:
+    """The export beside the photographs, read without points."""
+    flight.touch(root)
+    (root / "cameras.xml").write_text(xml, encoding="utf-8")
+    return read_project(root, "metashape", options or CaptureOptions(), needs_points=False)
 
 
 def metashape_rig(flight: TrueFlight, lens: Lens, bands: str = "Red") -> tuple[str, TrueFlight]:
