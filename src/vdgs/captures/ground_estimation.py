@@ -40,6 +40,7 @@ from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.up_axis import HINT, OR_CEILING, estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_centers
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import geometric_median, is_collinear, rotation_to_z
@@ -143,7 +144,7 @@ def _frame_without_distances(
 
 def _scene(source: SourceCapture) -> _Scene:
     poses = np.stack([view.camera_from_world for view in source.views])
-    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centers = camera_centers(poses)
     points = source.points[np.isfinite(source.points).all(axis=1)]
     return _Scene([view.name for view in source.views], centers, poses[:, :3, :3], points)
 

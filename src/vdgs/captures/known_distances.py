@@ -18,6 +18,7 @@ from vdgs.captures.formats.source_capture import SourceView
 from vdgs.captures.name_resolution import NameLookup, find_one
 from vdgs.captures.text_tables import read_lines
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center, camera_centers
 from vdgs.geometry.ray_intersection import intersect_rays
 
 #: Photographs that must show a point: one view tells a line, no place.
@@ -155,7 +156,7 @@ def known_scale_of_views(
         seen.setdefault(mark.name, []).append((view, _ray(mark, view, file)))
     check_marked(known, {name: {view.name for view, _ in marks} for name, marks in seen.items()}, file)
     located = {name: place for name, marks in seen.items() if (place := _locate(marks)) is not None}
-    centers = np.array([-view.camera_from_world[:3, :3].T @ view.camera_from_world[:3, 3] for view in views])
+    centers = np.array([camera_center(view.camera_from_world) for view in views])
     middle = np.median(points, axis=0)
     focal = np.array([view.intrinsics.focal[0] for view in views])
     pixel = float(np.median(np.linalg.norm(centers - middle, axis=1) / focal))
@@ -184,7 +185,7 @@ def _locate(marks: Sequence[tuple[SourceView, np.ndarray]]) -> LocatedPoint | No
     """The point nearest to all rays; None where they are parallel, or it lies behind a camera."""
     poses = np.array([view.camera_from_world[:3] for view, _ in marks])
     rays = np.array([ray for _, ray in marks])
-    centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
+    centers = camera_centers(poses)
     place = intersect_rays(centers, np.einsum("nji,nj->ni", poses[:, :, :3], rays))
     if place is None:
         return None

@@ -28,7 +28,7 @@ from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import find_range_errors
 from vdgs.errors import CaptureError
-from vdgs.geometry.camera import Camera
+from vdgs.geometry.camera import Camera, camera_centers
 from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.system.quoting import shell_word
 
@@ -118,7 +118,7 @@ def _check_options(root: Path, options: CaptureOptions) -> None:
 def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCapture:
     """Drop points that are not finite or absurdly far from the cameras."""
     poses = np.stack([view.camera_from_world for view in source.views])
-    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centers = camera_centers(poses)
     finite = np.isfinite(source.points).all(axis=1) & (np.abs(source.points) < 1e12).all(axis=1)
     if not finite.any():
         raise CaptureError(f"{source.source} model: none of its {len(source.points)} points is a finite number.")

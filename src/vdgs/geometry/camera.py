@@ -25,6 +25,16 @@ MAX_COORDINATE = 1e9
 NEAR_PLANE = 0.01
 
 
+def camera_center(camera_from_world: np.ndarray) -> np.ndarray:
+    """Where a camera is in the world, [3], by its pose [4, 4]."""
+    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+
+
+def camera_centers(poses: np.ndarray) -> np.ndarray:
+    """Where cameras are in the world, [n, 3], by their `camera_from_world` [n, 4, 4] (or their first three rows)."""
+    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
     """One view: pose and intrinsics at a given image size.
@@ -49,8 +59,7 @@ class Camera:
     @cached_property
     def position(self) -> np.ndarray:
         """Camera center in the world, [3] float64."""
-        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
-        return -rotation.T @ translation
+        return camera_center(self.camera_from_world)
 
     @cached_property
     def forward(self) -> np.ndarray:

@@ -32,6 +32,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError, VdgsError
+from vdgs.geometry.camera import camera_centers
 from vdgs.geometry.similarity import rotation_to_z
 from vdgs.kernels import default_num_threads
 from vdgs.runs.run_folder import RunFolder
@@ -243,7 +244,7 @@ def near_pairs(photographs: PosedPhotographs, num_neighbors: int) -> set[tuple[i
 
 def _near_views(views: Sequence[SourceView], source: SourceCapture, num_neighbors: int) -> set[tuple[int, int]]:
     poses = np.stack([view.camera_from_world for view in views])
-    rotations, centers = poses[:, :3, :3], -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    rotations, centers = poses[:, :3, :3], camera_centers(poses)
     level = np.eye(3)
     if source.georef is None:
         level = rotation_to_z(estimate_up(centers, rotations, centers, [])[0])

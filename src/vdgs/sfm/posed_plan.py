@@ -11,6 +11,7 @@ from rich.console import Console
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmRequest
+from vdgs.geometry.camera import camera_centers
 from vdgs.kernels import default_num_threads
 from vdgs.sfm.focal_length import Lens
 from vdgs.sfm.gps_priors import GpsPriors
@@ -67,7 +68,7 @@ def _with_lenses(photographs: PosedPhotographs) -> Iterator[ImageMetadata]:
 def _positions(photographs: PosedPhotographs) -> GpsPriors:
     """Where the cameras are, in the coordinates of the project."""
     poses = np.stack([view.view.camera_from_world for view in photographs.views])
-    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centers = camera_centers(poses)
     georef = photographs.source.georef
     origin = georef.origin if georef is not None and georef.origin is not None else (0.0, 0.0, 0.0)
     return GpsPriors(

@@ -8,6 +8,7 @@ import numpy as np
 
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_centers
 
 #: How many points, before those are left out that fewer cameras than `LEAST_CAMERAS` see.
 COUNT, LEAST_CAMERAS = 30_000, 3
@@ -24,8 +25,8 @@ def random_points(poses: Sequence[np.ndarray], lenses: Sequence[Intrinsics]) -> 
 
     Raises CaptureError for cameras that do not look at one place.
     """
-    rotations = np.stack([pose[:3, :3] for pose in poses])
-    centers = -np.einsum("nji,nj->ni", rotations, np.stack([pose[:3, 3] for pose in poses]))
+    stack = np.stack(poses)
+    rotations, centers = stack[:, :3, :3], camera_centers(stack)
     across = np.eye(3) - rotations[:, 2, :, None] * rotations[:, 2, None, :]
     spread = np.linalg.eigvalsh(across.mean(axis=0))[0]
     middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]

@@ -29,6 +29,7 @@ from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, r
 from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center, camera_centers
 from vdgs.geometry.geodesy import geodetic_from_enu
 
 #: Camera axes (right, down, forward) from those that CameraOrientation names: where its x and y point in the picture.
@@ -356,7 +357,7 @@ class _Block:
         ways = []
         for photo in self._photos.values():
             in_meters, shown = photo.pose.copy(), points[photo.sightings[0]]
-            turn, center = photo.pose[:3, :3], -photo.pose[:3, :3].T @ photo.pose[:3, 3]
+            turn, center = photo.pose[:3, :3], camera_center(photo.pose)
             in_meters[:3, 3] = -turn @ (center * to_meters)
             pixels = np.reshape(photo.sightings[1], (-1, 2))
             ways.append(TwoWays(photo.intrinsics, (in_meters, photo.pose), (shown * to_meters, shown), pixels))
@@ -364,7 +365,7 @@ class _Block:
 
     def _seems_degrees(self) -> bool:
         poses = np.array([photo.pose for photo in self._photos.values()]).reshape(-1, 4, 4)
-        centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+        centers = camera_centers(poses)
         return bool(
             len(centers) and (np.abs(centers[:, :2]) <= (180, 90)).all() and (np.ptp(centers, axis=0)[:2] < 1).all()
         )

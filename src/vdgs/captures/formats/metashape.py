@@ -36,6 +36,7 @@ from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, r
 from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center
 from vdgs.geometry.geodesy import SEMI_MAJOR_M
 from vdgs.geometry.similarity import Similarity
 
@@ -237,7 +238,7 @@ class _Chunk:
             pose[:3, 3] = chunk.apply(pose[:3, 3])
             pose[:3, :3] = chunk.rotation @ pose[:3, :3]
         inverse = np.eye(4)
-        inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+        inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, camera_center(pose)
         return inverse
 
     def _camera_to_chunk(self, camera: _Camera) -> np.ndarray:

@@ -28,6 +28,7 @@ from vdgs.captures.table_columns import number_of
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_centers
 from vdgs.geometry.crs import utm_epsg
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import rotation_about
@@ -384,7 +385,7 @@ def _report_system(
     if not views:
         return None, ""
     poses = np.stack([view.camera_from_world for view in views])
-    places = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    places = camera_centers(poses)
     if (np.abs(geodetic[:, 0]) <= 90).all():
         # Mostly that of the middle; of the first photograph, or of a list of control points, beside a border of zones.
         usual = int(utm_epsg(*np.median(geodetic, axis=0)[:2]).removeprefix("EPSG:"))

@@ -22,6 +22,7 @@ from vdgs.captures.system_names import is_local_system
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center
 
 _ENDING, _HEADER = "_calibrated_camera_parameters.txt", "fileName imageWidth imageHeight"
 #: Where PIX4Dmapper puts the file in the folder of a project, which lies beside its .p4d.
@@ -128,7 +129,7 @@ def _is_offset_lost(file: Path, views: Sequence[ProjectView]) -> bool:
     counted from: systems with a false origin are made so that eastings and northings are large."""
     if not views or _beside(file, _OFFSET).is_file():
         return False
-    centers = np.stack([-view.camera_from_world[:3, :3].T @ view.camera_from_world[:3, 3] for view in views])
+    centers = np.stack([camera_center(view.camera_from_world) for view in views])
     if np.abs(np.median(centers[:, :2], axis=0)).max() >= _NEAR:
         return False
     return max(map(abs, false_origin(_text(_beside(file, "_wkt.prj")).strip()))) >= _FALSE_ORIGIN

@@ -27,6 +27,7 @@ from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center, camera_centers
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import sample_points
 
@@ -174,7 +175,7 @@ class _World:
         if self.to_geodetic is None:
             return list(poses)
         stack = np.stack(poses)
-        centers = -np.einsum("nji,nj->ni", stack[:, :3, :3], stack[:, :3, 3])
+        centers = camera_centers(stack)
         ends = [self.moved(centers + sign * step) for step in np.diag(self.step) for sign in (1, -1)]
         slopes = np.stack([(ends[k] - ends[k + 1]) for k in (0, 2, 4)], axis=2)
         left, _, right = np.linalg.svd(slopes / np.linalg.norm(slopes, axis=1, keepdims=True))
@@ -195,7 +196,7 @@ def _world_of(project: Project) -> _World:
         local = Georef(None, "", project.place) if project.is_metric else None
         return _World(None, np.ones(3), local, project.file)
     stack = np.stack([view.camera_from_world for view in project.views])
-    centers = -np.einsum("nji,nj->ni", stack[:, :3, :3], stack[:, :3, 3])
+    centers = camera_centers(stack)
     geodetic = project.to_geodetic(centers)
     if not np.isfinite(geodetic).all() or (np.abs(geodetic[:, 0]) > 90).any():
         raise CaptureError(
@@ -256,7 +257,7 @@ def _after(change: Callable[[np.ndarray], np.ndarray], world: _World) -> Callabl
 def _seen(points: np.ndarray, poses: Sequence[np.ndarray], views: Sequence[ProjectView]) -> float:
     """The share of points that lie before some camera, where its photograph is, lens distortion aside."""
     points = points[np.isfinite(points).all(axis=1)]
-    centers = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
+    centers = np.stack([camera_center(pose) for pose in poses])
     farthest = MAX_DISTANCE_RATIO * float(
         np.quantile(np.linalg.norm(centers - np.median(centers, axis=0), axis=1), 0.9)
     )

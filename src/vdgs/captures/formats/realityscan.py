@@ -31,6 +31,7 @@ from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
 from vdgs.captures.text_tables import decode_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center, camera_centers
 from vdgs.geometry.geodesy import geodetic_from_ecef, is_earth_centered
 from vdgs.system.units import first_names
 
@@ -155,7 +156,7 @@ def _of_one_world(cameras: list[RegisteredCamera]) -> tuple[list[RegisteredCamer
     """Cameras that share a world, and what to say of the others: those of the component of most cameras, for each
     component has coordinates of its own; all of them in a projected system."""
     components = Counter(camera.component for camera in cameras)
-    centers = np.array([-each.camera_from_world[:3, :3].T @ each.camera_from_world[:3, 3] for each in cameras])
+    centers = np.array([camera_center(each.camera_from_world) for each in cameras])
     if len(components) < 2 or np.abs(np.median(centers[:, :2], axis=0)).max() > _PROJECTED_FROM:
         return cameras, []
     largest = components.most_common(1)[0][0]
@@ -177,7 +178,7 @@ def _world(views: tuple[ProjectView, ...], file: Path) -> tuple[ToGeodetic | Non
     if not views:
         return None, False, False, ""
     poses = np.stack([view.camera_from_world for view in views])
-    centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centers = camera_centers(poses)
     middle, spread = np.abs(np.median(centers, axis=0)), np.ptp(centers, axis=0)
     wide = spread[:2].max()
     if (

@@ -12,6 +12,7 @@ from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.source_capture import no_points
 from vdgs.captures.name_resolution import match_stem
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center
 from vdgs.geometry.similarity import fit_similarity_robust, is_collinear
 
 #: Names under which a point cloud in the capture's own world is looked for.
@@ -60,8 +61,8 @@ def find_sparse_points(
         )  # fmt: skip
     folder = max(models, key=count_images)
     model = read_colmap(folder)
-    theirs = {view.name: _center(view.camera_from_world) for view in model.views}
-    ours = {name: _center(pose) for name, pose in poses.items()}
+    theirs = {view.name: camera_center(view.camera_from_world) for view in model.views}
+    ours = {name: camera_center(pose) for name, pose in poses.items()}
     pairs = _match(list(theirs), list(ours), aliases or {})
     source = np.array([theirs[a] for a, _ in pairs]).reshape(-1, 3)
     target = np.array([ours[b] for _, b in pairs]).reshape(-1, 3)
@@ -89,10 +90,6 @@ def find_point_cloud(*folders: Path, lone: bool = False) -> Path | None:
     usual = [folder / name for folder in folders for name in POINT_CLOUDS]
     single = [files[0] for files in ([*folder.glob("*.ply")] for folder in folders) if len(files) == 1]
     return next((file for file in (*usual, *(single if lone else ())) if file.is_file()), None)
-
-
-def _center(camera_from_world: np.ndarray) -> np.ndarray:
-    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
 
 
 def _match(theirs: list[str], ours: list[str], aliases: Mapping[str, str]) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ import numpy as np
 from vdgs.captures.coordinate_systems import ToGeodetic
 from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.project import ProjectView
+from vdgs.geometry.camera import camera_center
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.geometry.ray_intersection import intersect_rays
 
@@ -57,7 +58,7 @@ def _off(point: SurveyedPoint, to_geodetic: ToGeodetic | None) -> np.ndarray | N
         pose = view.camera_from_world
         ray = np.append(pixel_rays(view.intrinsics, np.array([pixel]))[0], 1.0) @ pose[:3, :3]
         if np.isfinite(ray).all():
-            centers.append(-pose[:3, :3].T @ pose[:3, 3])
+            centers.append(camera_center(pose))
             rays.append(ray)
     if to_geodetic is None or len(rays) < 2:
         return None
