@@ -78,6 +78,23 @@ def _known_names(text: str) -> int:
     return max((len(known_columns(row.words)) for row in rows_of(head)), default=0)
 
 
+def read_text(file: Path) -> str:
+    """All of a file as by `decode_text`. Raises CaptureError where it cannot be read."""
+    try:
+        return decode_text(file.read_bytes())
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+
+
+def read_head(file: Path, num_bytes: int) -> str:
+    """The first bytes of a file as by `decode_text`; empty where it cannot be read."""
+    try:
+        with file.open("rb") as stream:
+            return decode_text(stream.read(num_bytes))
+    except OSError:
+        return ""
+
+
 def decode_text(data: bytes) -> str:
     """A text in UTF-8, UTF-16 or Windows' Latin, as programs on Windows write it."""
     text = _decode_unicode(data)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from vdgs.captures.formats.source_capture import (
 )
 from vdgs.captures.image_files import read_header, same_aspect
 from vdgs.captures.name_resolution import find_file
-from vdgs.captures.text_tables import decode_text
+from vdgs.captures.text_tables import read_text
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
@@ -56,15 +57,19 @@ def mask_of_frame(frame: JsonObject, file: Path, root: Path) -> Path | None:
 
 def read_capture_json(file: Path) -> JsonObject:
     """The object in a JSON file. Raises `CaptureError` for anything else."""
-    try:
-        content = json.loads(decode_text(file.read_bytes()))
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{file}: is not JSON ({error}). Export it again.") from None
+    content = read_json_text(file, "Export it again.")
     if not isinstance(content, dict):
         raise CaptureError(f"{file}: must hold a JSON object.")
     return content
+
+
+def read_json_text(file: Path, remedy: str) -> Any:
+    """What a JSON file holds. Raises `CaptureError`, which ends in the remedy, for a file that is none."""
+    text = read_text(file)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{file}: is not JSON ({error}). {remedy}") from None
 
 
 def get_frames(content: JsonObject, file: Path, key: str = "frames") -> list[JsonObject]:

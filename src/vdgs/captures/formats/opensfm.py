@@ -7,7 +7,6 @@ world over it, UTM minus an offset, and keeps this one as reconstruction.topocen
 
 from __future__ import annotations
 
-import json
 import re
 from array import array
 from collections.abc import Mapping, Sequence
@@ -20,12 +19,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vdgs.captures.coordinate_systems import ToGeodetic, to_geodetic
-from vdgs.captures.formats.json_poses import parse_number, parse_vector, read_capture_json
+from vdgs.captures.formats.json_poses import parse_number, parse_vector, read_capture_json, read_json_text
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.gps_tables import check_geodetic
 from vdgs.captures.table_columns import number_of
-from vdgs.captures.text_tables import decode_text
+from vdgs.captures.text_tables import read_head
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_centers
@@ -43,7 +42,7 @@ _HEAD_BYTES = 2048
 _SAME_PLACE_DEG, _SAME_PLACE_M = 1e-5, 0.01
 _AGAIN = "Export it again."
 #: What other lists of cameras hold: what vdgs writes, the cameras of a trained 3DGS scene, and UAVScenes.
-_OTHER_LISTS = (b"matrix_world", b'"img_name"', b'"OriginalImageName"')
+_OTHER_LISTS = ("matrix_world", '"img_name"', '"OriginalImageName"')
 _UNDISTORT = "Undistort the photographs (opensfm undistort), and give the undistorted folder"
 #: COLMAP's model of each projection, and its distortion in COLMAP's order; with one focal length or two.
 _ONE_FOCAL = {"perspective": ("RADIAL", ("k1", "k2")), "fisheye": ("RADIAL_FISHEYE", ("k1", "k2"))}
@@ -70,14 +69,10 @@ def is_file(file: Path) -> bool:
     of an ODM project."""
     if file.suffix not in (".json", ".geojson"):
         return False
-    try:
-        with file.open("rb") as stream:
-            head = decode_text(stream.read(_HEAD_BYTES)).lstrip().encode()
-    except OSError:
-        return False
+    head = read_head(file, _HEAD_BYTES).lstrip()
     if file.suffix == ".geojson":
-        return b"FeatureCollection" in head
-    return head.startswith(b"[") and b"{" in head and not any(text in head for text in _OTHER_LISTS)
+        return "FeatureCollection" in head
+    return head.startswith("[") and "{" in head and not any(text in head for text in _OTHER_LISTS)
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
@@ -195,12 +190,7 @@ def _center(shot: JsonObject, file: Path) -> np.ndarray:
 
 def _biggest(file: Path) -> tuple[JsonObject, list[str]]:
     """The reconstruction of most photographs in a file, and a warning that names the photographs of the others."""
-    try:
-        content = json.loads(decode_text(file.read_bytes()))
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{file}: is not JSON ({error}). {_AGAIN}") from None
+    content = read_json_text(file, _AGAIN)
     found = [each for each in content if isinstance(each, dict) and isinstance(each.get("shots"), dict)]
     found = [each for each in found if each["shots"]]
     if not found:

@@ -19,7 +19,7 @@ from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import xml_numbers
 from vdgs.captures.system_names import is_local_system
-from vdgs.captures.text_tables import decode_text
+from vdgs.captures.text_tables import read_head, read_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_center
@@ -41,21 +41,12 @@ def find_files(root: Path) -> list[Path]:
 
 
 def is_file(file: Path) -> bool:
-    if file.suffix.lower() != ".txt":
-        return False
-    try:
-        with file.open("rb") as stream:
-            return decode_text(stream.read(4 * len(_HEADER))).startswith(_HEADER)
-    except OSError:
-        return False
+    return file.suffix.lower() == ".txt" and read_head(file, 4 * len(_HEADER)).startswith(_HEADER)
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
     """The calibrated cameras of a project. Raises `CaptureError` for damaged files and fisheyes."""
-    try:
-        lines = decode_text(file.read_bytes()).splitlines()
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    lines = read_text(file).splitlines()
     head = next((index for index, line in enumerate(lines) if line.startswith("camera model")), None)
     rows = [line.strip() for line in lines[(0 if head is None else head) + 1 :] if line.strip()]
     if head is None or len(rows) % _LINES:
@@ -109,8 +100,8 @@ def _system(file: Path) -> tuple[ToGeodetic | None, str, bool, tuple[CloudFrame,
     offset_file, system_file = _beside(file, _OFFSET), _beside(file, "_wkt.prj")
     offset = np.zeros(3)
     if offset_file.is_file():
-        offset = np.array(xml_numbers(_text(offset_file), 3, offset_file, "the offset"))
-    wkt = _text(system_file).strip() if system_file.is_file() else ""
+        offset = np.array(xml_numbers(read_text(offset_file), 3, offset_file, "the offset"))
+    wkt = read_text(system_file).strip() if system_file.is_file() else ""
     if not wkt or is_local_system(wkt):
         is_metric = bool(wkt) or bool(offset.any())
         return None, "Pix4D, metres of a system of its own" if is_metric else "", is_metric, ()
@@ -132,11 +123,4 @@ def _is_offset_lost(file: Path, views: Sequence[ProjectView]) -> bool:
     centers = np.stack([camera_center(view.camera_from_world) for view in views])
     if np.abs(np.median(centers[:, :2], axis=0)).max() >= _NEAR:
         return False
-    return max(map(abs, false_origin(_text(_beside(file, "_wkt.prj")).strip()))) >= _FALSE_ORIGIN
-
-
-def _text(file: Path) -> str:
-    try:
-        return decode_text(file.read_bytes())
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    return max(map(abs, false_origin(read_text(_beside(file, "_wkt.prj")).strip()))) >= _FALSE_ORIGIN

@@ -28,7 +28,7 @@ from vdgs.captures.formats.photograph_sizes import GIVE_ALIGNED, name_unaligned,
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_centered, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
-from vdgs.captures.text_tables import decode_text
+from vdgs.captures.text_tables import decode_text, read_head
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_center, camera_centers
@@ -225,12 +225,8 @@ def _named_system(file: Path) -> tuple[ToGeodetic, str] | None:
 
 def _is_table(file: Path, *, with_lens: bool = False) -> bool:
     """Whether a file begins with the columns of registered cameras, their focal lengths among them or not."""
-    try:
-        with file.open("rb") as stream:
-            head = decode_text(stream.read(_HEAD_BYTES))
-    except OSError:
-        return False
-    found = [columns for columns in map(_column_names, head.splitlines()[:3]) if columns is not None]
+    head = read_head(file, _HEAD_BYTES).splitlines()[:3]
+    found = [columns for columns in map(_column_names, head) if columns is not None]
     return any(not with_lens or not _FOCAL.isdisjoint(names) for _, names in found)
 
 
@@ -330,11 +326,7 @@ def _xmp_below(folder: Path, deep: bool = True) -> list[Path]:
 
 
 def _is_xmp(file: Path) -> bool:
-    try:
-        with file.open("rb") as stream:
-            return _NAMESPACE in decode_text(stream.read(4 * _HEAD_BYTES))
-    except OSError:
-        return False
+    return _NAMESPACE in read_head(file, 4 * _HEAD_BYTES)
 
 
 def read_xmp(file: Path) -> RegisteredCamera | str:

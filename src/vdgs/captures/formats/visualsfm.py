@@ -17,7 +17,7 @@ from vdgs.captures.formats.photograph_sizes import GIVE_ALIGNED, check_seen_insi
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_centered, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending
-from vdgs.captures.text_tables import decode_text
+from vdgs.captures.text_tables import read_head, read_text
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -29,13 +29,7 @@ _AGAIN = "The file is damaged or cut off; export it again."
 
 
 def is_file(file: Path) -> bool:
-    if file.suffix.lower() != ".nvm":
-        return False
-    try:
-        with file.open("rb") as stream:
-            return decode_text(stream.read(4 * len(_HEADER))).startswith(_HEADER)
-    except OSError:
-        return False
+    return file.suffix.lower() == ".nvm" and read_head(file, 4 * len(_HEADER)).startswith(_HEADER)
 
 
 def find_files(root: Path) -> list[Path]:
@@ -44,10 +38,7 @@ def find_files(root: Path) -> list[Path]:
 
 def read(file: Path, options: CaptureOptions) -> Project:
     """The first model of a file, which is the biggest. Raises `CaptureError` for damaged files."""
-    try:
-        lines = [line.strip() for line in decode_text(file.read_bytes()).splitlines()]
-    except OSError as error:
-        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    lines = [line.strip() for line in read_text(file).splitlines()]
     header, lines = lines[0].split() if lines else [], [line for line in lines[1:] if line and line[0] != "#"]
     count = _count(lines, 0, file)
     cameras = [_camera(line, header[0] == _MATRIX, file) for line in lines[1 : count + 1]]
