@@ -14,7 +14,6 @@ Views from where nobody flew (`captures.off_path`) have a folder of their own, w
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from jaxtyping import Float
 from vdgs.captures.capture import View
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.system.array_files import DAMAGED_FILE_ERRORS
 
 _FOLDER = "truth"
 #: Depth is stored as its logarithm in so many steps between its bounds; 0 is sky.
@@ -117,5 +117,5 @@ def _read(file: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
             f"{file}: not there. Generate the capture with --truth; visibility is known for test and validation "
             "photographs only."
         ) from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED_FILE_ERRORS as error:
         raise VdgsError(f"{file}: is damaged ({error}). Generate the capture again.") from None

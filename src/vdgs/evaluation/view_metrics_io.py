@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from vdgs.errors import RunError
 from vdgs.evaluation.block_seams import BlockViewMetrics
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.comparison_images import Thumbnail
 from vdgs.evaluation.depth_errors import DepthErrors
 from vdgs.evaluation.view_metrics import ViewMetrics
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.array_files import explain_damaged_part, load_arrays, save_arrays
 from vdgs.system.documents import JsonObject
 
 FILE_FORMAT = "vdgs-view-1"
@@ -41,29 +38,20 @@ def save_view_metrics(path: Path, metrics: ViewMetrics, block_metrics: BlockView
     if block_metrics is not None:
         parts["blocks"] = block_metrics.by_block.to_arrays() | {"row": _text(block_metrics.row)}
         parts["seams"] = block_metrics.seams.to_arrays()
-    buffer = io.BytesIO()
-    named = {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
-    np.savez(buffer, allow_pickle=False, **named)
-    write_bytes(path, buffer.getvalue())
+    save_arrays(path, {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()})
 
 
 def load_view_metrics(path: Path) -> tuple[ViewMetrics, BlockViewMetrics | None]:
     """The inverse of `save_view_metrics`. Raises RunError if the file is missing or damaged."""
-    try:
+    with explain_damaged_part(path):
         return _read(path)
-    # What zipfile and numpy raise on damaged bytes has no common base.
-    except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
-        raise RunError(
-            f"{path}: is missing or damaged ({error}). Delete {path.parent} and run the same command again."
-        ) from error
 
 
 def _read(path: Path) -> tuple[ViewMetrics, BlockViewMetrics | None]:
     parts = defaultdict[str, dict[str, np.ndarray]](dict)
-    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-        for key in file.files:
-            part, _, name = key.partition("/")
-            parts[part][name] = file[key]
+    for key, array in load_arrays(path).items():
+        part, _, name = key.partition("/")
+        parts[part][name] = array
     if str(parts["view"]["format"]) != FILE_FORMAT:
         raise ValueError(f"it is not a {FILE_FORMAT} file")
     depth = {part.removeprefix("depth-"): DepthErrors.of(each) for part, each in parts.items() if part[:6] == "depth-"}

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import struct
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,17 +11,11 @@ import numpy as np
 from vdgs.errors import RunError
 from vdgs.partition.assignment.assign_cameras import REASONS, Assignment
 from vdgs.partition.assignment.score_matrix import ScoreMatrix
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.array_files import DAMAGED_FILE_ERRORS, explain_damaged_part, load_arrays, save_arrays
 
 FILE_FORMAT = "vdgs-scores-1"
 #: The arrays of the file over cameras and blocks, with their types.
 MATRICES = {"scores": np.float32, "visible_anchors": np.int32, "coverage": np.float32, "reasons": np.int8}
-
-#: What zipfile and numpy raise on damaged bytes has no common base.
-DAMAGED_FILE_ERRORS = (
-    OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, NotImplementedError,
-    RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
-)  # fmt: skip
 
 
 class ScoreFile(NamedTuple):
@@ -40,40 +30,32 @@ def save_scores(path: Path, names: Sequence[str], scores: ScoreMatrix, assignmen
     """Write an .npz file (without pickle; the same bytes for the same content), atomically."""
     if len(names) != len(scores.scores):
         raise ValueError(f"{len(names)} names for {len(scores.scores)} cameras")
-    buffer = io.BytesIO()
-    np.savez(
-        buffer, format=np.array(FILE_FORMAT), mode=np.array(scores.mode),
-        names=np.array(names, np.str_), warnings=np.array(assignment.warnings, np.str_),
-        scores=scores.scores, visible_anchors=scores.visible_anchors, coverage=scores.coverage, anchors=scores.anchors,
-        nadir_block=scores.nadir_block, reasons=assignment.reasons,
+    texts = {"names": np.array(names, np.str_), "warnings": np.array(assignment.warnings, np.str_)}
+    save_arrays(
+        path, {
+            "format": np.array(FILE_FORMAT), "mode": np.array(scores.mode), **texts, "scores": scores.scores,
+            "visible_anchors": scores.visible_anchors, "coverage": scores.coverage, "anchors": scores.anchors,
+            "nadir_block": scores.nadir_block, "reasons": assignment.reasons,
+        },
     )  # fmt: skip
-    write_bytes(path, buffer.getvalue())
 
 
 def save_score_rows(path: Path, scores: ScoreMatrix) -> None:
     """Write the rows of some cameras, to be joined later (.npz without pickle), atomically."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{name: np.array(value) for name, value in vars(scores).items()})
-    write_bytes(path, buffer.getvalue())
+    save_arrays(path, {name: np.array(value) for name, value in vars(scores).items()})
 
 
 def load_score_rows(path: Path) -> ScoreMatrix:
     """The inverse of `save_score_rows`. Raises RunError if the file is missing or damaged."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+    with explain_damaged_part(path):
+        arrays = load_arrays(path)
         return ScoreMatrix(mode=str(arrays.pop("mode")), **arrays)
-    except DAMAGED_FILE_ERRORS as error:
-        raise RunError(
-            f"{path}: is missing or damaged ({error}). Delete {path.parent} and run the same command again."
-        ) from error
 
 
 def load_scores(path: Path) -> ScoreFile:
     """The inverse of `save_scores`. Raises RunError if the file is missing or damaged."""
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = load_arrays(path)
         _check(arrays)
     except FileNotFoundError as error:
         raise RunError(f"{path}: is not there. Assign the cameras first: vdgs partition RUN") from error

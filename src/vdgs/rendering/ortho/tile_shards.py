@@ -5,16 +5,13 @@ FOLDER/shards/KEY/NN/   of shard NN: a file for each of its tiles (`distributed.
 
 from __future__ import annotations
 
-import io
 import os
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, fields, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from vdgs.config.commands import OrthoRequest
@@ -22,7 +19,6 @@ from vdgs.distributed.job_labels import shard_kind
 from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.shard import Results, Shard
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds, split_ranges
-from vdgs.errors import RunError
 from vdgs.rendering.ortho.detail_transfer import HALO_PX, cache_sizes
 from vdgs.rendering.ortho.ortho_plan import OrthoPlan
 from vdgs.rendering.ortho.pixel_grid import TILE_PX
@@ -31,7 +27,7 @@ from vdgs.runs.lod_folder import drawn_scene
 from vdgs.runs.open_run import ModelLocation
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.atomic_files import write_bytes
+from vdgs.system.array_files import explain_damaged_part, load_arrays, save_arrays
 from vdgs.system.memory.memory_estimate import render_bytes
 
 #: Tiles of a shard, least and most, and how many shards there are in between (choice).
@@ -96,17 +92,11 @@ def draw_shard(shard: Shard) -> None:
 
 def save_tile(path: Path, tile: OrthoTile) -> None:
     """Write an .npz file (without pickle), atomically."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{each.name: getattr(tile, each.name) for each in fields(OrthoTile)})
-    write_bytes(path, buffer.getvalue())
+    save_arrays(path, {each.name: getattr(tile, each.name) for each in fields(OrthoTile)})
 
 
 def load_tile(path: Path) -> OrthoTile:
     """The inverse of `save_tile`. Raises RunError if the file is missing or damaged."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            return OrthoTile(**{each.name: file[each.name] for each in fields(OrthoTile)})
-    # What zipfile and numpy raise on damaged bytes has no common base.
-    except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
-        remedy = f"Delete {path.parent} and run the same command again."
-        raise RunError(f"{path}: is missing or damaged ({error}). {remedy}") from error
+    with explain_damaged_part(path):
+        arrays = load_arrays(path)
+        return OrthoTile(**{each.name: arrays[each.name] for each in fields(OrthoTile)})
