@@ -161,7 +161,7 @@ def not_for_a_card(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 @pytest.fixture(scope="session")
 def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a coarse model of fifteen photographs, and five others to test with. Not to be changed: others copy
-    it (`cluster_support.copy_run`)."""
+    it (`support.clusters.copy_run`)."""
     from support.captures import tiny_scene, write_colmap
     from support.clusters import COARSE
     from support.commands import vdgs

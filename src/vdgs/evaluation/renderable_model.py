@@ -34,7 +34,7 @@ class EvaluatedModel:
     model_bytes: int | None = None
     train_seconds: float | None = None
     peak_memory_bytes: int | None = None
-    #: What tells the model from any other, and the settings that it was made with (`runs.keys`).
+    #: What tells the model from any other, and the settings that it was made with (`runs.stage_keys`).
     model_digest: str | None = None
     key: str | None = None
 

@@ -24,7 +24,7 @@ class ModelMetadata:
     version: str | None = None
     #: Steps of training that the model has seen.
     iterations: int | None = None
-    #: Of the settings that it was made with (`runs.keys`).
+    #: Of the settings that it was made with (`runs.stage_keys`).
     key: str | None = None
     #: Of a block: its number, how many photographs trained it, and its setting `decoder`.
     block: int | None = None

@@ -35,7 +35,7 @@ class OpenedModel:
     #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
     name: str
     status: StatusRecord
-    #: Of the settings that it was made with (`runs.keys`).
+    #: Of the settings that it was made with (`runs.stage_keys`).
     key: str
     #: Why it is not the model that one would expect (no merged one, or one that is out of date); empty where it is.
     warning: str
