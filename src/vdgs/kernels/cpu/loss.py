@@ -12,7 +12,7 @@ from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.arguments import new_floats
 from vdgs.kernels.kernel_types import PhotometricLoss
-from vdgs.kernels.torch_ref.loss import check_images
+from vdgs.kernels.torch_ref.loss import check_float32_images
 
 
 def photometric_loss(
@@ -24,7 +24,7 @@ def photometric_loss(
 ) -> PhotometricLoss:
     """As `torch_ref.photometric_loss`, for float32 images. Differentiable once; the gradient is computed with the loss.
     Same bits for any number of threads. Takes some 0.5 MB a thread beside the gradient."""
-    _check(image, target, mask)
+    check_float32_images(image, target, mask)
     return PhotometricLoss(*_Photometric.apply(image, target, mask, ssim_weight))
 
 
@@ -36,15 +36,9 @@ def photometric_loss_vjp(
     ssim_weight: float = 0.2,
 ) -> tuple[PhotometricLoss, Float[Tensor, "h w 3"]]:
     """As `torch_ref.photometric_loss_vjp`; bits and errors are those of `photometric_loss`."""
-    _check(image, target, mask)
+    check_float32_images(image, target, mask)
     gradient = new_floats(*image.shape)
     return PhotometricLoss(*_measure(image, target, mask, ssim_weight, gradient)), gradient
-
-
-def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
-    check_images(image, target, mask)
-    if image.dtype != torch.float32:
-        raise TypeError(f"image must be float32, not {image.dtype}")
 
 
 def _measure(

@@ -12,7 +12,7 @@ from torch import Tensor
 from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.kernel_types import PhotometricLoss
-from vdgs.kernels.torch_ref.loss import check_images
+from vdgs.kernels.torch_ref.loss import check_float32_images
 
 #: Side of the tile that one block of threads does: kTile of the source.
 TILE_PX = 16
@@ -30,7 +30,7 @@ def photometric_loss(
     """As `torch_ref.photometric_loss`, for float32 images on a CUDA device, without waiting for it. Differentiable
     once, deterministic. The gradient is computed with the loss and takes 36 bytes a pixel until then. Raises TypeError
     for tensors elsewhere, ValueError for several devices, CudaUnavailable where the kernel cannot be run."""
-    _check(image, target, mask)
+    check_float32_images(image, target, mask)
     return PhotometricLoss(*_Photometric.apply(image, target, mask, ssim_weight, program))
 
 
@@ -44,16 +44,10 @@ def photometric_loss_vjp(
 ) -> tuple[PhotometricLoss, Float[Tensor, "h w 3"]]:
     """As `torch_ref.photometric_loss_vjp`; waits, bits and errors are those of `photometric_loss`. (Autograd goes
     backward in a thread of its own: on a card that takes longer than the kernels.)"""
-    _check(image, target, mask)
+    check_float32_images(image, target, mask)
     *values, gradient = _run(_pictures(image, target, mask), ssim_weight, True, program)
     assert gradient is not None
     return PhotometricLoss(*values), gradient
-
-
-def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
-    check_images(image, target, mask)
-    if image.dtype != torch.float32:
-        raise TypeError(f"image must be float32, not {image.dtype}")
 
 
 def _pictures(*tensors: Tensor | None) -> list[Tensor | None]:

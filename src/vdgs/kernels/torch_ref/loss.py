@@ -82,6 +82,13 @@ def gaussian_window(dtype: torch.dtype = torch.float64) -> Float[Tensor, "taps"]
     return (weight / weight.sum()).to(dtype)
 
 
+def check_float32_images(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    """As `check_images`, for kernels that compute in float32."""
+    check_images(image, target, mask)
+    if image.dtype != torch.float32:
+        raise TypeError(f"image must be float32, not {image.dtype}")
+
+
 def check_images(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
     """Raise a clear error unless the three fit together."""
     if image.dtype not in (torch.float32, torch.float64):
