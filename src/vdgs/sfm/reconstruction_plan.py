@@ -30,6 +30,7 @@ from vdgs.sfm.image_list import ImageList, collect_images
 from vdgs.sfm.panoramas import with_views
 from vdgs.sfm.preflight import PreflightReport, make_preflight_report
 from vdgs.sfm.scale_bars import ScaleBars, read_scale_bars
+from vdgs.system.scratch import nearest_existing
 from vdgs.system.units import data_size
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
@@ -216,10 +217,7 @@ def check_disk_space(plan: ReconstructionPlan) -> None:
     copied = sum(photo.width * photo.height for photo in photographs if photo.kind or photo.face)
     needed = BYTES_PER_PIXEL * (1.32 * pixels + copied)
     needed += BYTES_PER_FEATURE * options.max_num_features * len(photographs)
-    parent = next(
-        folder for folder in (plan.request.output.resolve(), *plan.request.output.resolve().parents) if folder.exists()
-    )
-    free = shutil.disk_usage(parent).free
+    free = shutil.disk_usage(nearest_existing(plan.request.output.resolve())).free
     if free < needed:
         raise VdgsError(
             f"{plan.request.output}: needs about {data_size(needed)}, {data_size(free)} are free there. Free "

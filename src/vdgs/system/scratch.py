@@ -45,10 +45,14 @@ def scratch_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def nearest_existing(path: Path) -> Path:
+    """An absolute path itself where it is there, else the innermost of its folders that is."""
+    return next(each for each in (path, *path.parents) if each.exists())
+
+
 def check_takes_files(folder: Path) -> None:
     """Raise VdgsError, before long work, where no file can be made in a folder that is there or will be created."""
-    there = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
-    with explain_disk_errors(folder), tempfile.TemporaryFile(dir=there):
+    with explain_disk_errors(folder), tempfile.TemporaryFile(dir=nearest_existing(folder.absolute())):
         pass
 
 

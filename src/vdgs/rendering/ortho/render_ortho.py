@@ -31,6 +31,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.console import print_warning, track
 from vdgs.system.documents import MapMetadata
+from vdgs.system.scratch import nearest_existing
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.system.units import data_size
 
@@ -157,8 +158,7 @@ def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> Non
     share = _DISK_SHARE + sharded  # tiles of shards lie beside it until all are gathered
     bytes_per_pixel = sum(layer.bytes_per_pixel for layer in raster_layers(placement))
     needed = int(share * grid.width * grid.height * bytes_per_pixel) + 5_000_000
-    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
-    free = shutil.disk_usage(existing).free
+    free = shutil.disk_usage(nearest_existing(folder.absolute())).free
     size = f"{grid.width * grid.gsd:.1f} x {grid.height * grid.gsd:.1f} {placement.unit}"
     console.print(
         f"map: {grid.width} x {grid.height} pixels of {grid.gsd:g} {placement.unit}, {size}, {placement.name}; heights "
