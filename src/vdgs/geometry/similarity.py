@@ -190,6 +190,12 @@ def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -
     return np.linalg.norm(similarity.apply(source) - target, axis=1)
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation [3, 3] with the least squared difference to a matrix; of a sum of rotations, their mean."""
+    left, _, right = np.linalg.svd(matrix)
+    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+
+
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
     """The smallest rotation [3, 3] that takes the unit vector `up` to z (half a turn about x for -z)."""
     x, y, z = up / np.linalg.norm(up)

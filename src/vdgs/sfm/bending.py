@@ -13,7 +13,7 @@ from vdgs.sfm.georegistration import Georegistration, transform_model
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
-from vdgs.sfm.up_direction import model_points
+from vdgs.sfm.up_direction import model_centers, model_points
 from vdgs.sfm.workspace import call_cancellable
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -139,8 +139,7 @@ def _options(hold_focal: bool, threads: int) -> pycolmap.BundleAdjustmentOptions
 
 def _height(model: pycolmap.Reconstruction) -> float:
     """Median distance of the cameras to the median point."""
-    centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
-    return float(np.median(np.linalg.norm(centers - np.median(model_points(model), axis=0), axis=1)))
+    return float(np.median(np.linalg.norm(model_centers(model) - np.median(model_points(model), axis=0), axis=1)))
 
 
 def _laid_back(model: pycolmap.Reconstruction, bent: pycolmap.Reconstruction, numbers: Sequence[int]) -> Similarity:

@@ -27,7 +27,7 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
-from vdgs.sfm.up_direction import BY_ATTITUDES, model_points, up_of
+from vdgs.sfm.up_direction import BY_ATTITUDES, model_centers, model_points, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 
 WITHOUT = (
@@ -149,7 +149,7 @@ def _by_distance(
     up, notes = up_of(model, prepared.image_list.images)
     factor, share = scale
     rotation = rotation_to_z(up.direction)
-    centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+    centers = model_centers(model)
     middle = np.append(np.median(centers @ rotation.T, axis=0)[:2], 0.0)
     edge = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     accuracy = AccuracyFacts(
@@ -272,10 +272,9 @@ class Doubts:
             by_gps = georegistration.georegister(model, photographs, positions)
         except CaptureError:  # positions that are mirrored say nothing of control points
             by_gps = AlignmentFailure("", "")
-        centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
         return cls(
             up=up_of(model, photographs)[0],
-            centers=centers,
+            centers=model_centers(model),
             ground=model_points(model),
             by_gps=by_gps if isinstance(by_gps, Georegistration) else None,
             gps=positions.source,
@@ -369,8 +368,7 @@ def _refuse_no_scene(
     model: pycolmap.Reconstruction, ground: float, placed: Georegistration, prepared: ReconstructionPlan
 ) -> None:
     """Raise CaptureError for a placed world that is larger than any, whatever made it so."""
-    centers = np.array([image.projection_center() for image in model.images.values() if image.has_pose])
-    if why := why_no_scene(centers, ground):
+    if why := why_no_scene(model_centers(model), ground):
         raise CaptureError(
             f"placed by {placed.method} ({prepared.gps_priors.source}), {why}. Are metres or feet read as degrees or "
             "kilometres? Mend them, or say --georeference off (without positions). " + LOCAL_METERS + "."

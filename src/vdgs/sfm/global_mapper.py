@@ -24,6 +24,7 @@ from rich.markup import escape
 
 from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
 from vdgs.errors import CaptureError, VdgsError
+from vdgs.geometry.similarity import nearest_rotation
 from vdgs.sfm import feature_matching, incremental_mapper
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.image_metadata import EXACT_MODEL
@@ -182,8 +183,7 @@ def _keeps_shape(part: pycolmap.Reconstruction, joined: pycolmap.Reconstruction)
     centers, moved = (np.array([of[name].projection_center() for name in names]) for of in (before, after))
     rotations = [np.array([of[name].cam_from_world().rotation.matrix() for name in names]) for of in (before, after)]
     # By the rotations of the cameras, for their places leave it open where they lie on one line.
-    left, _, right = np.linalg.svd(np.einsum("nji,njk->ik", *rotations))
-    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    turn = nearest_rotation(np.einsum("nji,njk->ik", *rotations))
     centers, moved = centers - centers.mean(axis=0), (moved - moved.mean(axis=0)) @ turn.T
     off = np.linalg.norm(centers - (centers * moved).sum() / (moved**2).sum() * moved, axis=1)
     cosines = (np.einsum("nij,jk,nik->n", rotations[0], turn, rotations[1]) - 1) / 2

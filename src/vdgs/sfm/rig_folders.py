@@ -11,6 +11,7 @@ import numpy as np
 
 from vdgs.captures.name_resolution import match_key
 from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.geometry.similarity import nearest_rotation
 from vdgs.sfm.flights import time_of
 from vdgs.sfm.focal_length import lens_numbers
 from vdgs.sfm.image_metadata import ImageMetadata
@@ -140,7 +141,5 @@ def _turns(frames: Frames) -> np.ndarray | None:
 
 def degrees_from_mean(rotations: np.ndarray) -> np.ndarray:
     """By how many degrees each rotation [n, 3, 3] is turned from the mean of all."""
-    left, _, right = np.linalg.svd(rotations.sum(axis=0))
-    mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    cosines = (np.einsum("nij,ij->n", rotations, mean) - 1) / 2
+    cosines = (np.einsum("nij,ij->n", rotations, nearest_rotation(rotations.sum(axis=0))) - 1) / 2
     return np.asarray(np.degrees(np.arccos(np.clip(cosines, -1, 1))))

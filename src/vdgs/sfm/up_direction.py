@@ -94,6 +94,11 @@ def tilt_from_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Im
     return float(np.degrees(np.linalg.norm(tilt)))
 
 
+def model_centers(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Places of the cameras that have one, [n, 3]."""
+    return np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+
+
 def model_points(model: pycolmap.Reconstruction) -> np.ndarray:
     """Places of all points, [n, 3]."""
     return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
