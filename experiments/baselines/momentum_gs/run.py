@@ -28,18 +28,12 @@ from vdgs.training.session.trainer import finish_stage, image_cache_bytes
 from vdgs.training.session.training_session import restore_or_start
 
 
-def train_momentum_blocks(
-    context: RunContext,
-    console: Console,
-    config: MomentumConfig | None = None,
-    options: CheckpointOptions | None = None,
-    device: str = "cpu",
-) -> None:
+def train_momentum_blocks(context: RunContext, console: Console, device: str = "cpu") -> None:
     """Train, or continue, all blocks of a run that is cut, on a device; nothing if they are finished.
 
     Raises RunError where no block has anchors and photographs, and what `run_session` raises.
     """
-    config, options, run = config or MomentumConfig(), options or CheckpointOptions(), context.run
+    config, options, run = MomentumConfig(), CheckpointOptions(), context.run
     with run.locked():
         blocks, key, method = load_run_blocks(run), run.keys().blocks, run.method()
         folders = [run.block(index) for index in range(len(blocks))]

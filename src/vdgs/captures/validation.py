@@ -72,9 +72,9 @@ def validate_capture(capture: Capture) -> ValidationReport:
     )  # fmt: skip
 
 
-def require_valid(capture: Capture, report: ValidationReport | None = None) -> ValidationReport:
+def require_valid(capture: Capture) -> ValidationReport:
     """What `validate_capture` says of a capture. Raises `CaptureError` where it cannot become a scene."""
-    report = report or validate_capture(capture)
+    report = validate_capture(capture)
     if report.problems:
         raise CaptureError(f"{capture.root}: cannot become a scene.\n  " + "\n  ".join(report.problems))
     return report

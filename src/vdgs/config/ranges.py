@@ -97,9 +97,9 @@ def to_flag(path: tuple[str, ...]) -> str:
     return "--" + ".".join(path).replace("_", "-")
 
 
-def find_range_errors(settings: Any, within: tuple[str, ...] = ()) -> list[str]:
-    """One sentence for every number outside its range; empty if there is none. `within` names the groups around it."""
-    return [f"{each.flag} {each.value}: must be {each.range}" for each in iter_out_of_range(settings, within)]
+def find_range_errors(settings: Any) -> list[str]:
+    """One sentence for every number outside its range; empty if there is none."""
+    return [f"{each.flag} {each.value}: must be {each.range}" for each in iter_out_of_range(settings)]
 
 
 def check_ranges(settings: Any) -> None:

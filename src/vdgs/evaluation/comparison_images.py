@@ -60,9 +60,9 @@ def absolute_error(
     return np.abs(image.astype(np.int16) - reference.astype(np.int16)).mean(axis=2) / 255.0
 
 
-def colorize(values: Float[np.ndarray, "h w"], limit: float, cmap: str = ERROR_CMAP) -> UInt8[np.ndarray, "h w 3"]:
+def colorize(values: Float[np.ndarray, "h w"], limit: float) -> UInt8[np.ndarray, "h w 3"]:
     """Values from 0 to `limit` (clipped) to colors; NaN becomes white."""
-    table = (mpl.colormaps[cmap](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
+    table = (mpl.colormaps[ERROR_CMAP](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
     known = ~np.isnan(values)
     levels = np.clip(np.where(known, values, 0.0) / limit, 0.0, 1.0) * 255.0 + 0.5
     picture = table[levels.astype(np.uint8)]
@@ -109,11 +109,11 @@ def draw_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Imag
     return canvas
 
 
-def draw_contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None) -> Image.Image:
+def draw_contact_sheet(cells: list[Thumbnail], title: str) -> Image.Image:
     """Cells in a grid, photograph above render, the name and the caption below each pair."""
     if not cells:
         raise ValueError("a contact sheet needs at least one view")
-    columns = columns or min(len(cells), max(1, round(np.sqrt(len(cells) * 1.9))))
+    columns = min(len(cells), max(1, round(np.sqrt(len(cells) * 1.9))))
     rows = -(-len(cells) // columns)
     width = max(cell.render.shape[1] for cell in cells)
     height = max(cell.render.shape[0] for cell in cells)
@@ -140,11 +140,9 @@ def draw_contact_sheet(cells: list[Thumbnail], title: str, columns: int | None =
     return canvas
 
 
-def make_thumbnail(
-    image: UInt8[np.ndarray, "h w 3"], width: int = THUMBNAIL_PX
-) -> UInt8[np.ndarray, "small_h small_w 3"]:
+def make_thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "small_h small_w 3"]:
     """The picture at the width of a contact sheet cell; a tall one is bounded by the same height."""
-    scale = width / max(image.shape[1], image.shape[0])
+    scale = THUMBNAIL_PX / max(image.shape[1], image.shape[0])
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     return np.asarray(resize(image, size))
 

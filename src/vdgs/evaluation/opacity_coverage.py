@@ -129,9 +129,9 @@ def summarize_oversized_splats(rows: Sequence[Mapping[str, Any]]) -> dict[str, i
 
 
 def coverage_map(
-    draw_depth: Callable[[Camera], Raster], cameras: Sequence[Camera], min_views: int = MIN_SEEN_BY
+    draw_depth: Callable[[Camera], Raster], cameras: Sequence[Camera]
 ) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
-    """Camera of a view -> which of its pixels show a place that lies in the pictures of at least `min_views` of
+    """Camera of a view -> which of its pixels show a place that lies in the pictures of at least `MIN_SEEN_BY` of
     `cameras` (the training cameras; without occlusion, as in V).
 
     A solid pixel shows the point at which the model behind `draw_depth` (a render with depth) is half opaque. All other
@@ -153,7 +153,7 @@ def coverage_map(
         # A scene that is a ghost has no solid pixel: what it half shows has to answer for it.
         depth = fill_depth(raster.median_depth.cpu().numpy(), solid if solid.any() else drawn)
         places = torch.from_numpy(camera.unproject(depth).reshape(-1, 3))
-        held = count_visibility(places, cameras).numpy().reshape(drawn.shape) >= min_views
+        held = count_visibility(places, cameras).numpy().reshape(drawn.shape) >= MIN_SEEN_BY
         return held & (drawn | below_horizon(camera, *drawn.shape))
 
     return seen

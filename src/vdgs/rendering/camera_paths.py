@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,33 +115,24 @@ def flyover(
     template: Camera,
     seconds: float = DEFAULT_SECONDS,
     fps: float = DEFAULT_FPS,
-    tilt_deg: float | None = None,
 ) -> CameraPath:
     """Along the track of the training cameras, smoothed, looking ahead and down.
 
-    `tilt_deg` is the angle from straight down; by default the median of the training cameras, at least
-    20. Where it is not given and views converge on a place (`find_convergence`), the film looks at that place, along
-    the track of the cameras that do: what is ahead in an orbit is not what it was flown for. Cameras are taken in the
-    order given, or from neighbor to neighbor where that is much shorter (names do not always follow the flight). The
-    speed is even.
+    Its angle from straight down is the median of the training cameras, at least `FLYOVER_TILT_DEG`. Where views
+    converge on a place (`find_convergence`), the film looks at that place, along the track of the cameras that do: what
+    is ahead in an orbit is not what it was flown for. Cameras are taken in the order given, or from neighbor to
+    neighbor where that is much shorter (names do not always follow the flight). The speed is even.
     """
     if not cameras:
         raise ValueError("a flyover needs training cameras")
+    converged = find_convergence(cameras)
+    if converged is not None:
+        poses = _poses_about(converged, cameras, frame_count(seconds, fps))
+        return CameraPath(tuple(replace(template, camera_from_world=pose) for pose in poses), fps, converged)
     from scipy.ndimage import gaussian_filter1d
 
-    converged = find_convergence(cameras) if tilt_deg is None else None
-    if converged is not None:
-        place, looking = converged.place, np.stack([camera.position for camera in cameras])[converged.looking]
-        away = np.linalg.norm(looking - place, axis=1)
-        # Distances are smoothed by themselves: a smoothed ring is narrower, and what is tall would not fit the frames.
-        track, away = np.split(_smooth_track(np.column_stack([looking, away]), frame_count(seconds, fps)), [3], axis=1)
-        offsets = track - place
-        offsets *= away / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
-        poses = (look_at_pose(place + offset, place) for offset in offsets)
-        return CameraPath(tuple(replace(template, camera_from_world=pose) for pose in poses), fps, converged)
-    if tilt_deg is None:
-        downwards = np.clip([-camera.forward[2] for camera in cameras], -1.0, 1.0)
-        tilt_deg = max(FLYOVER_TILT_DEG, float(np.degrees(np.arccos(np.median(downwards)))))
+    downwards = np.clip([-camera.forward[2] for camera in cameras], -1.0, 1.0)
+    tilt_deg = max(FLYOVER_TILT_DEG, float(np.degrees(np.arccos(np.median(downwards)))))
     n_frames = frame_count(seconds, fps)
     track = _smooth_track(np.stack([camera.position for camera in cameras]), n_frames)
     # Turns take a second: where one strip ends and the next begins, the track folds back on itself.
@@ -156,6 +147,17 @@ def flyover(
         pose = look_at_pose(position, position + forward, up=level if tilt_deg < 45.0 else np.array([0.0, 0.0, 1.0]))
         frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
+
+
+def _poses_about(converged: Convergence, cameras: Sequence[Camera], n_frames: int) -> Iterator[np.ndarray]:
+    """Poses along the smoothed track of the cameras whose views converge on a place, all of them looking at it."""
+    place, looking = converged.place, np.stack([camera.position for camera in cameras])[converged.looking]
+    away = np.linalg.norm(looking - place, axis=1)
+    # Distances are smoothed by themselves: a smoothed ring is narrower, and what is tall would not fit the frames.
+    track, away = np.split(_smooth_track(np.column_stack([looking, away]), n_frames), [3], axis=1)
+    offsets = track - place
+    offsets *= away / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
+    return (look_at_pose(place + offset, place) for offset in offsets)
 
 
 def look_at_pose(position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.ndarray = (0, 0, 1)) -> np.ndarray:

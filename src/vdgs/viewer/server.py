@@ -52,8 +52,8 @@ REFRESH_SECONDS = 2.0
 _browser: ContextVar[str | None] = ContextVar("browser", default=None)
 
 
-def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], None] | None = None) -> None:
-    """Serve a run until Ctrl-C. `on_ready` is called with the address once it can be opened.
+def view_run(request: ViewRequest, console: Console) -> None:
+    """Serve a run until Ctrl-C.
 
     Raises VdgsError for a run without a model, an address that cannot be used, and where viser is not installed.
     """
@@ -75,8 +75,6 @@ def view_run(request: ViewRequest, console: Console, on_ready: Callable[[str], N
     with ending, catch_stop_signals(interrupts=True), serve(run, request.host, request.port, console) as viewer:
         for line in startup_message(run.summary, viewer.access):
             console.print(line, highlight=False, soft_wrap=True)
-        if on_ready is not None:
-            on_ready(viewer.access.local_url())
         _serve_until_stopped(viewer, request, seen, console)
 
 

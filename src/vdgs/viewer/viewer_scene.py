@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ from vdgs.runs.visibility_store import get_run_visibility, with_fade
 from vdgs.viewer.lod import LodLevel, LodPyramid
 from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility
 
-ModelChoice = Literal["coarse", "merged"]
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
 #: (choice: about a second on two cores, reading included).
 REST_ERROR_PX, PREVIEW_ERROR_PX, REST_MAX_COST = 0.2, 1.0, 4_250_000

@@ -18,7 +18,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
 from vdgs.kernels.cuda.compile_cache import load_or_compile
 from vdgs.kernels.cuda.driver import Driver, GridSize, get_cuda_driver
-from vdgs.kernels.cuda.nvrtc import CompileTarget, Nvrtc, get_nvrtc
+from vdgs.kernels.cuda.nvrtc import CompileTarget, get_nvrtc
 
 COMPILE_OPTIONS = ("--std=c++17",)
 #: Limits of every card since compute capability 3.0.
@@ -39,14 +39,12 @@ def read_header(name: str) -> str:
     return (Path(__file__).parents[1] / "shared" / name).read_text(encoding="utf-8")
 
 
-def compile_source(
-    name: str, target: CompileTarget, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None
-) -> bytes:
+def compile_source(name: str, target: CompileTarget, *, headers: Sequence[str] = ()) -> bytes:
     """A source of this package with these shared headers, compiled, from the cache if it is there.
 
     Raises CompileError, CudaUnavailable.
     """
-    compiler = compiler or get_nvrtc()
+    compiler = get_nvrtc()
     source, texts = read_source(name), {title: read_header(title) for title in headers}
     parts = {f"header {title}": text for title, text in texts.items()}
     parts |= {
