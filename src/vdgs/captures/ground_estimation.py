@@ -27,7 +27,7 @@ from vdgs.captures.camera_height import view_distance
 from vdgs.captures.capture_order import natural_key
 from vdgs.captures.flight_extent import LOCAL_METERS, why_no_scene
 from vdgs.captures.formats.source_capture import SourceCapture, WorldPrior
-from vdgs.captures.georeference import Georef, match_gps, read_georef
+from vdgs.captures.georeference import Georef, GpsPositions, match_gps, read_georef
 from vdgs.captures.gps_altitudes import refuse_unit, wrong_unit
 from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.odd_positions import MIN_SPREAD_M, do_not_spread
@@ -232,10 +232,9 @@ def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
     """Similarity from camera centers to ENU, or None (with a warning) where the flight does not fix one."""
     positions = match_gps(scene.names, file)
-    indices, geodetic, has_altitudes = positions.images, positions.geodetic, positions.has_altitudes
+    indices, geodetic = positions.images, positions.geodetic
     warnings += positions.notes
-    centers = scene.centers[indices]
-    if is_collinear(centers):
+    if is_collinear(scene.centers[indices]):
         warnings.append(
             f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
             "fix no up axis; the frame is estimated from the cameras instead and is not metric."
@@ -249,23 +248,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             "scale nor north; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    views = up_by_views(scene.centers, scene.rotations, scene.points)
-    times = _taken_in_order([scene.names[i] for i in indices])
-    up = Up(views.direction, views.deviation_deg, "the views", views.sure, other=views.other)
-    said = np.isfinite(positions.deviations).all(axis=1)
-    usual = [USUAL_M[0], *USUAL_M]
-    deviations = with_unstated(np.where(said[:, None], positions.deviations, usual), said)
-    problem = Problem(
-        centers=centers, targets=enu, times=times, up=up, has_altitudes=has_altitudes,
-        stated=deviations if are_told(deviations, said) else None, relative=relative_deviations(deviations),
-    )  # fmt: skip
-    image = enu * [-1.0, 1.0, 1.0]  # of which exchanged axes are a turn
-    is_told = up.sure or (up.other is not None and up.other.doubt == OR_CEILING)
-    if is_told and mirrored(centers, enu, up.direction, {"the mirror image": image}):
-        raise CaptureError(
-            f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
-            "minus sign of south or west missing? Mend the table, or leave --gps out."
-        )
+    problem = _problem(scene, positions, enu)
+    _refuse_mirrored(problem, file)
     problem, doubt = with_likelier_up(problem)
     if doubt:
         warnings.append(f"{file.name}: {doubt}. If that is wrong, leave --gps out, and {HINT}")
@@ -276,14 +260,55 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         return None
     if weighed := weighing_note(fit.deviations, fit.inliers):
         warnings.append(f"{file.name}: {weighed}")
-    similarity, inliers, has_altitudes = fit.similarity, fit.inliers, fit.altitude != "none"
-    if not inliers.all():
-        names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
-        warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
+    if not fit.inliers.all():
+        names = ", ".join(scene.names[i] for i in indices[~fit.inliers][:5])
+        warnings.append(f"{file.name}: {(~fit.inliers).sum()} GPS positions left out as outliers ({names}).")
+    frame = _frame_of_fit(fit, origin, positions.datum_error_m, file)
+    frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), frame.description)
+    if why := why_no_scene(frame.to_ground(scene.centers), 0.0):
+        raise CaptureError(f"{file}: placed by it, {why}. Mend the table, or leave --gps out. {LOCAL_METERS}.")
+    if fit.altitude == "none" and frame.origin_geo is not None:
+        frame = replace(frame, origin_geo=(*frame.origin_geo[:2], 0.0))
+    _compare_up(scene, frame, warnings)
+    return frame
+
+
+def _problem(scene: _Scene, positions: GpsPositions, enu: np.ndarray) -> Problem:
+    """What is known for the fit of the cameras to a table's positions, which are `enu` [n, 3] in metres."""
+    views = up_by_views(scene.centers, scene.rotations, scene.points)
+    said = np.isfinite(positions.deviations).all(axis=1)
+    usual = [USUAL_M[0], *USUAL_M]
+    deviations = with_unstated(np.where(said[:, None], positions.deviations, usual), said)
+    return Problem(
+        centers=scene.centers[positions.images], targets=enu,
+        times=_taken_in_order([scene.names[i] for i in positions.images]),
+        up=Up(views.direction, views.deviation_deg, "the views", views.sure, other=views.other),
+        has_altitudes=positions.has_altitudes, stated=deviations if are_told(deviations, said) else None,
+        relative=relative_deviations(deviations),
+    )  # fmt: skip
+
+
+def _refuse_mirrored(problem: Problem, file: Path) -> None:
+    """Raise CaptureError for positions that fit the cameras only as their mirror image."""
+    up = problem.up
+    image = problem.targets * [-1.0, 1.0, 1.0]  # of which exchanged axes are a turn
+    is_told = up.sure or (up.other is not None and up.other.doubt == OR_CEILING)
+    if is_told and mirrored(problem.centers, problem.targets, up.direction, {"the mirror image": image}):
+        raise CaptureError(
+            f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
+            "minus sign of south or west missing? Mend the table, or leave --gps out."
+        )
+
+
+def _frame_of_fit(
+    fit: PositionFit, origin: tuple[float, float, float], datum_error_m: float, file: Path
+) -> GroundFrame:
+    """The frame that a fit to positions in ENU of the origin makes, and how good it is in words."""
+    inliers, has_altitudes = fit.inliers, fit.altitude != "none"
     axes = slice(3 if has_altitudes else 2)
     rms = float(np.sqrt((fit.residuals[inliers, axes] ** 2).sum(axis=1).mean()))
     across, *up_m = fit.place_error_m
-    across = float(np.hypot(across, positions.datum_error_m))
+    across = float(np.hypot(across, datum_error_m))
     place = by_axis(
         (across, *up_m) if has_altitudes else (across,),
         ("across", "up"),
@@ -291,24 +316,16 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     )
     method = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
     accuracy = f"place {place}, scale ±{fit.scale_error:.2%} (95 %)"
-    how = f"{method}; {accuracy}"
-    frame = GroundFrame(
-        scale=similarity.scale,
-        rotation=similarity.rotation,
-        translation=similarity.translation,
+    return GroundFrame(
+        scale=fit.similarity.scale,
+        rotation=fit.similarity.rotation,
+        translation=fit.similarity.translation,
         metric=True,
-        description=how,
+        description=f"{method}; {accuracy}",
         origin_geo=origin,
         accuracy=accuracy,
         method=f"{method} ({file.name})",
     )
-    frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
-    if why := why_no_scene(frame.to_ground(scene.centers), 0.0):
-        raise CaptureError(f"{file}: placed by it, {why}. Mend the table, or leave --gps out. {LOCAL_METERS}.")
-    if not has_altitudes and frame.origin_geo is not None:
-        frame = replace(frame, origin_geo=(*frame.origin_geo[:2], 0.0))
-    _compare_up(scene, frame, warnings)
-    return frame
 
 
 def _taken_in_order(names: Sequence[str]) -> np.ndarray:
