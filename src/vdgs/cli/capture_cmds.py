@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rich.markup import escape
 
@@ -17,6 +17,9 @@ from vdgs.config.typed_paths import MaybeFolder
 from vdgs.errors import CaptureError
 from vdgs.synth.synth_options import SynthOptions
 from vdgs.system.quoting import shell_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,6 @@ def sfm_command(arguments: list[str]) -> None:
     from vdgs.captures.format_dispatch import lacks_points
     from vdgs.captures.output_guard import is_capture
     from vdgs.sfm.image_list import HOW_TO_MAKE_NEW_POSES
-    from vdgs.sfm.reconstruction_plan import print_plan
 
     request = SfmRequest(
         image_folders=args.images, output=args.output, gps=args.gps, threads=args.threads,
@@ -130,23 +132,8 @@ def sfm_command(arguments: list[str]) -> None:
             f"--images {args.project_images}: is for projects, whose photographs lie elsewhere. Of photographs alone "
             "give their own folder, without --images."
         )
-    if args.dry_run and is_posed:
-        from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
-
-        print_posed_plan(*plan_posed_capture(request, options), console)
-        console.print("Nothing was written.", highlight=False)
-        return
     if args.dry_run:
-        from vdgs.sfm.films.take_frames import temporary_frames
-        from vdgs.sfm.reconstruct import describe_work_left, look_at_work
-        from vdgs.sfm.sfm_estimate import estimate_sfm
-
-        with temporary_frames(request, console) as with_frames:
-            plan, left = look_at_work(with_frames, None)
-            if said := describe_work_left(request, left):
-                console.print(escape(said), highlight=False)
-            print_plan(plan, estimate_sfm(plan).text(plan.threads) if left == "all" else "", console)
-        console.print("Nothing was written.", highlight=False)
+        _print_sfm_plan(request, options, is_posed, console)
         return
     if is_posed:
         from vdgs.sfm.posed_capture import make_posed_capture
@@ -159,3 +146,23 @@ def sfm_command(arguments: list[str]) -> None:
     capture = args.output.resolve()
     run = shell_line(["vdgs", "run", capture, "--output", f"{capture}-run", "--preset", "laptop"])
     console.print(escape(f"capture: {args.output}\nnext: {run}"), highlight=False)
+
+
+def _print_sfm_plan(request: SfmRequest, options: CaptureOptions, is_posed: bool, console: Console) -> None:
+    """Say what `vdgs sfm` would do, of photographs alone or with poses (`is_posed`)."""
+    if is_posed:
+        from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
+
+        print_posed_plan(*plan_posed_capture(request, options), console)
+    else:
+        from vdgs.sfm.films.take_frames import temporary_frames
+        from vdgs.sfm.reconstruct import describe_work_left, look_at_work
+        from vdgs.sfm.reconstruction_plan import print_plan
+        from vdgs.sfm.sfm_estimate import estimate_sfm
+
+        with temporary_frames(request, console) as with_frames:
+            plan, left = look_at_work(with_frames, None)
+            if said := describe_work_left(request, left):
+                console.print(escape(said), highlight=False)
+            print_plan(plan, estimate_sfm(plan).text(plan.threads) if left == "all" else "", console)
+    console.print("Nothing was written.", highlight=False)
