@@ -227,14 +227,11 @@ def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
             if may_be_sensor(folder) and may_be_sensor(name):
                 continue
             for pairs, how in ((_of_one_name, "name, moment, place"), (_of_one_moment, "camera, moment, place")):
-                alike = [
-                    (one, photo)
-                    for one, photo in pairs(other, folders[folder])
-                    if one.name not in found and photo.name not in found and _is_one_exposure(one, photo)
-                ]
+                new = [pair for pair in pairs(other, folders[folder]) if not any(photo.name in found for photo in pair)]
+                alike = [(one, photo) for one, photo in new if _is_one_exposure(one, photo)]
                 if alike and _show_the_same(alike):
-                    for one, photo in alike:
-                        found[photo.name] = f"is another version of {one.name}, by its {how} and what it shows"
+                    why = f"by its {how} and what it shows"
+                    found |= {photo.name: f"is another version of {one.name}, {why}" for one, photo in alike}
         kept.append((folder, folders[folder]))
     return found
 
