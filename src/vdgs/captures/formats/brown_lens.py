@@ -158,14 +158,21 @@ def _affine(lens: Intrinsics) -> tuple[float, float]:
     return terms[6], terms[9]
 
 
-def _bent(lens: Intrinsics, rays: np.ndarray) -> np.ndarray:
-    k1, k2, p1, p2, k3, k4, _, p3, p4, _, *odd = _terms(lens)
-    x, y = rays.T
-    r2 = x * x + y * y
+def _stretch(lens: Intrinsics, r2: np.ndarray) -> np.ndarray:
+    """By how much the radial terms lengthen rays, by the squares of their lengths."""
+    k1, k2, _, _, k3, k4, _, _, _, _, *odd = _terms(lens)
     d = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
     if any(odd):
         o1, o3, o5, o7 = odd
         d = d + np.sqrt(r2) * (o1 + r2 * (o3 + r2 * (o5 + r2 * o7)))
+    return d
+
+
+def _bent(lens: Intrinsics, rays: np.ndarray) -> np.ndarray:
+    _, _, p1, p2, _, _, _, p3, p4, *_ = _terms(lens)
+    x, y = rays.T
+    r2 = x * x + y * y
+    d = _stretch(lens, r2)
     if p3 or p4:
         g = 1 + r2 * (p3 + r2 * p4)
         p1, p2 = p1 * g, p2 * g  # type: ignore[assignment]
@@ -179,13 +186,11 @@ def _slopes(lens: Intrinsics, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     k1, k2, p1, p2, k3, k4, _, p3, p4, _, *odd = _terms(lens)
     x, y = rays.T
     r2 = x * x + y * y
-    d = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    d = _stretch(lens, r2)
     slope = 2 * (k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4)))
     if any(odd):
         o1, o3, o5, o7 = odd
-        r = np.sqrt(r2)
-        d = d + r * (o1 + r2 * (o3 + r2 * (o5 + r2 * o7)))
-        slope = slope + (o1 + r2 * (3 * o3 + r2 * (5 * o5 + r2 * 7 * o7))) / np.maximum(r, 1e-12)
+        slope = slope + (o1 + r2 * (3 * o3 + r2 * (5 * o5 + r2 * 7 * o7))) / np.maximum(np.sqrt(r2), 1e-12)
     g = 1 + r2 * (p3 + r2 * p4)
     more = 2 * (p3 + r2 * 2 * p4)
     tangential_x, tangential_y = 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
