@@ -17,7 +17,15 @@ from jaxtyping import Float, UInt32
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Y_DOWN, Axes, axes_named
-from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, base_colors, logits_from_opacity, opacities
+from vdgs.export.formats.export_scene import (
+    CHUNK_SIZE,
+    OTHER_PARTS,
+    ExportScene,
+    base_colors,
+    logits_from_opacity,
+    opacities,
+    smallest_three,
+)
 from vdgs.export.formats.foreign_gaussians import warn_antialiased
 from vdgs.export.formats.gaussian_ply import draws_antialiased, header_comments, write_crs_beside
 from vdgs.export.formats.gaussian_store import write_store
@@ -128,10 +136,8 @@ def _join(units: np.ndarray, widths: tuple[int, ...]) -> UInt32[np.ndarray, " n"
 
 def _rotation(quaternions: Float[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]:
     """Which of w, x, y, z is largest, then the others in their order, 10 bits each."""
-    largest = np.abs(quaternions).argmax(1)
-    signed = np.where(quaternions[np.arange(len(quaternions)), largest][:, None] < 0, -quaternions, quaternions)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    small = np.take_along_axis(signed, others, 1) * np.sqrt(0.5) + 0.5
+    largest, others = smallest_three(quaternions)
+    small = others * np.sqrt(0.5) + 0.5
     return (largest.astype(np.uint32) << np.uint32(30)) | _join(small, (10, 10, 10))
 
 
@@ -233,8 +239,7 @@ def _part(words: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
 def _quaternions(words: np.ndarray) -> torch.Tensor:
     small = (_part(words, (10, 10, 10)) - 0.5) * np.sqrt(2)
     largest = words >> np.uint32(30)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
     found = np.empty((len(words), 4))
-    np.put_along_axis(found, others, small, 1)
+    np.put_along_axis(found, OTHER_PARTS[largest], small, 1)
     found[np.arange(len(words)), largest] = np.sqrt(np.maximum(0, 1 - (small**2).sum(1)))
     return torch.from_numpy(found.astype(np.float32))

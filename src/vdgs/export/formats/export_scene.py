@@ -26,6 +26,8 @@ from vdgs.system.atomic_files import write_json
 
 #: Writers work on so many Gaussians at a time, however large the chunks are that they are given: about 100 MB.
 CHUNK_SIZE = 1 << 17
+#: Of w, x, y, z the three others, by which is the largest.
+OTHER_PARTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,13 @@ def gaussian_scales(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:
 def logits_from_opacity(opacity: Float[np.ndarray, " n"], steps: int = 255) -> Float[Tensor, " n"]:
     """Opacities before the sigmoid. Those of a file in steps are kept half a step away from 0 and 1."""
     return torch.logit(torch.from_numpy(np.clip(opacity, 0.5 / steps, 1 - 0.5 / steps).astype(np.float32)))
+
+
+def smallest_three(quaternions: Float[np.ndarray, "n 4"]) -> tuple[np.ndarray, Float[np.ndarray, "n 3"]]:
+    """Which of w, x, y, z is largest [n], and the others in their order where that one is positive."""
+    rows, largest = np.arange(len(quaternions)), np.abs(quaternions).argmax(1)
+    signed = np.where(quaternions[rows, largest][:, None] < 0, -quaternions, quaternions)
+    return largest, np.take_along_axis(signed, OTHER_PARTS[largest], 1)
 
 
 def base_colors(gaussians: Gaussians) -> Float[np.ndarray, "n 3"]:

@@ -25,6 +25,7 @@ from vdgs.export.formats.export_scene import (
     ExportMetadata,
     ExportScene,
     opacities,
+    smallest_three,
     to_uint8,
     write_metadata_file,
 )
@@ -168,11 +169,8 @@ def _signed_log(positions: np.ndarray) -> np.ndarray:
 
 def _packed(quaternions: np.ndarray) -> np.ndarray:
     """The three smaller of w, x, y, z in a byte each, and which is largest: 252 and up."""
-    rows = np.arange(len(quaternions))
-    largest = np.abs(quaternions).argmax(1)
-    signed = np.where(quaternions[rows, largest][:, None] < 0, -quaternions, quaternions)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    small = to_uint8(np.take_along_axis(signed, others, 1) * (math.sqrt(2) / 2) + 0.5)
+    largest, others = smallest_three(quaternions)
+    small = to_uint8(others * (math.sqrt(2) / 2) + 0.5)
     return np.concatenate([small, (252 + largest[:, None]).astype(np.uint8)], 1)
 
 
