@@ -108,6 +108,12 @@ def project_gaussians(
     )
 
 
+def variances_px2(conics: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2"]:
+    """Variances along x and y: the conic [[a, b], [b, c]] is the inverse of the covariance."""
+    a, b, c = conics.unbind(-1)
+    return torch.stack([c, a], -1) / (a * c - b * b)[:, None]
+
+
 def dilations_px2(
     depths: Float[Tensor, " m"], camera: Camera, least: float = DILATION_PX2
 ) -> Float[Tensor, " m"] | float:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels import get_backend
+from vdgs.kernels.gaussian_projection import variances_px2
 from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.spherical_harmonics import eval_sh_colors
 from vdgs.model.scale_bounds import MAX_SIGMA
@@ -94,10 +95,7 @@ def visible_gaussian_rows(gaussians: Gaussians, camera: Camera) -> Int64[Tensor,
     """Rows of the Gaussians in front of the camera whose extent touches the image, ascending."""
     kernels = get_backend(gaussians.means.device)
     seen = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
-    a, b, c = seen.conics.unbind(-1)
-    # The inverse of the conic [[a, b], [b, c]] is the covariance, its diagonal the variances along x and y.
-    variances = torch.stack([c, a], -1) / (a * c - b * b)[:, None]
-    reach = MAX_SIGMA * variances.sqrt()
+    reach = MAX_SIGMA * variances_px2(seen.conics).sqrt()
     low, high = seen.means_px + reach, seen.means_px - reach
     inside = (low > 0).all(-1) & (high[:, 0] < camera.width) & (high[:, 1] < camera.height)
     # A needle whose determinant is lost to rounding has no extent that could be compared: it is drawn.

@@ -17,7 +17,7 @@ from vdgs.errors import UnsupportedOption
 from vdgs.geometry.camera import NEAR_PLANE, Camera, is_rigid_motion
 from vdgs.kernels import KERNELS_ENV_VAR, get_backend
 from vdgs.kernels.constants import ALPHA_MIN, DILATION_PX2
-from vdgs.kernels.gaussian_projection import GaussianShapes, project_gaussians
+from vdgs.kernels.gaussian_projection import GaussianShapes, project_gaussians, variances_px2
 from vdgs.kernels.kernel_types import ProjectedGaussians, Splats
 from vdgs.kernels.spherical_harmonics import MAX_SH_DEGREE, eval_sh_colors, num_sh_bases
 from vdgs.ops.arrays import Array, like, to_torch
@@ -354,10 +354,8 @@ def _symmetric(covars: Tensor) -> Tensor:
 
 def _radii(projected: ProjectedGaussians, opacities: Tensor, settings: _Settings) -> Tensor:
     """How far a Gaussian is drawn from its center, [n, 2] int32 px: 0 for one that no pixel shows, as in gsplat."""
-    a, b, c = projected.conics.unbind(-1)
-    variances = torch.stack([c, a], -1) / (a * c - b * b)[:, None]
     extent = (2 * (opacities / ALPHA_MIN).clamp(min=1).log()).sqrt().clamp(max=MAX_EXTENT)
-    radii = (extent[:, None] * variances.sqrt()).ceil().nan_to_num()
+    radii = (extent[:, None] * variances_px2(projected.conics).sqrt()).ceil().nan_to_num()
     low, high = projected.means_px + radii, projected.means_px - radii
     size = radii.new_tensor([settings.width, settings.height])
     shown = projected.valid & (opacities >= ALPHA_MIN) & (radii > settings.radius_clip).any(-1)
