@@ -14,6 +14,7 @@ from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import gray_masks_note, masked_shares, verify_image
 from vdgs.errors import CaptureError
 from vdgs.system.content_digests import find_copies
+from vdgs.system.units import some_names
 
 #: Rounding by this share of the distance between cameras and points is about a pixel (choice).
 MAX_ROUNDING_RATIO = 1e-3
@@ -122,13 +123,13 @@ def _check_view(view: View) -> _CheckedView:
 def _warnings(blank: list[str], masked: float, copies: list[tuple[str, ...]]) -> list[str]:
     found = []
     if copies:
-        shown = ", ".join(" = ".join(names[:3]) for names in copies[:3]) + (", ..." if len(copies) > 3 else "")
+        shown = some_names([" = ".join(names[:3]) for names in copies], 3)
         found.append(
             f"{sum(map(len, copies))} photographs are the same file as another one, under other names ({shown}). Where "
             "their poses differ, only one of these can be right: remove the copies, or put the right photographs there."
         )
     if blank:
-        shown = ", ".join(blank[:5]) + (", ..." if len(blank) > 5 else "")
+        shown = some_names(blank)
         found.append(f"photographs of one color only, which teach nothing but that: {len(blank)} ({shown}).")
     if masked > MAX_MASKED_FRACTION:
         found.append(f"masks leave out {masked:.0%} of the photographs. White is kept: are they inverted?")

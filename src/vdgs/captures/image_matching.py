@@ -24,6 +24,7 @@ from vdgs.captures.strays import MASKED, masked_stem
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.units import some_names
 
 #: Photographs whose size differs from that of most by more than this share are mentioned; rounding differs by less.
 MAX_SIZE_DEVIATION = 0.2
@@ -57,7 +58,7 @@ def match_images(
     source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
     spare = _without_camera(source, paths)
     if spare:
-        shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
+        shown = some_names(spare)
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
     return _fitted(root, source, paths, options, warnings), len(spare)
 
@@ -136,7 +137,7 @@ def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:
     others = np.flatnonzero(np.abs(factors / usual - 1) > MAX_SIZE_DEVIATION)
     if not len(others):
         return []
-    names = ", ".join(photographs[index].view.name for index in others[:5]) + (", ..." if len(others) > 5 else "")
+    names = some_names([photographs[index].view.name for index in others])
     sizes = " to ".join(dict.fromkeys(f"{size:.3g}" for size in (factors[others].min(), factors[others].max())))
     return [
         f"{len(others)} of {len(factors)} photographs are not shrunk as the rest, to {sizes} of the size of "

@@ -11,6 +11,7 @@ from vdgs.captures.name_resolution import find_file, largest_shrunk
 from vdgs.captures.strays import MASK_FOLDERS
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.units import some_names
 
 
 def find_masks(
@@ -79,8 +80,12 @@ def _compare(folder: Path, masks: dict[str, Path | None], asked_for: bool, warni
     if not used:
         warnings.append(f"{folder} holds no masks; all photographs count whole.")
     elif spare:
-        shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
-        warnings.append(f"{folder}: {len(spare)} masks belong to no photograph and are not used ({shown}).")
+        warnings.append(unused_masks_note(folder, spare))
+
+
+def unused_masks_note(folder: Path, spare: Sequence[str]) -> str:
+    """What to say of masks in a folder, by these names, that belong to no photograph."""
+    return f"{folder}: {len(spare)} masks belong to no photograph and are not used ({some_names(spare)})."
 
 
 def mask_name(name: str) -> str:

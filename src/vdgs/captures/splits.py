@@ -19,6 +19,7 @@ from vdgs.captures.flight_parts import MIN_STRIP, OBLIQUE_DEGREES, flight_strips
 from vdgs.captures.split_lists import TEST_LIST, TEST_LISTS, VALIDATION_LIST, listed_photographs, own_list
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.units import some_names
 
 #: Splits that follow from positions and headings.
 _BY_FLIGHT = ("strips", "obliques")
@@ -53,7 +54,7 @@ def assign_splits(
     chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True) if split is not None]
     unlisted = [view.name for view, split in zip(views, splits, strict=True) if split is None]
     if unlisted and options.split not in _BY_FLIGHT:
-        shown = ", ".join(unlisted[:5]) + (", ..." if len(unlisted) > 5 else "")
+        shown = some_names(unlisted)
         warnings.append(
             f"{len(unlisted)} of {len(views)} photographs stand in none of the capture's lists of training and test "
             f"photographs and are left out ({shown}). --split every uses them all."

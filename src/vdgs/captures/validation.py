@@ -20,6 +20,7 @@ from vdgs.captures.capture import Capture, View
 from vdgs.captures.image_checks import check_images
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import geometric_median, sample_points
+from vdgs.system.units import some_names
 from vdgs.visibility.visibility_counts import count_visibility
 
 #: Sparse points looked at when there are more.
@@ -34,7 +35,6 @@ WARN_REPROJECTION_PX, MAX_REPROJECTION_PX, MAX_REPROJECTION_RATIO = 1.5, 3.0, 0.
 MIN_PARALLAX_PX, WARN_PARALLAX_RATIO = 1.0, 0.02
 #: Fewer distinct points than this span no surface; fewer than the second are hardly a model of a place.
 MIN_DISTINCT_POINTS, WARN_DISTINCT_POINTS = 4, 50
-MAX_NAMES_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, finding
     blind = [view.name for view in capture.views if not bool(count_visibility(places, [view.camera]).any())]
     if blind:
         findings.warnings.append(
-            f"{len(blind)} of {len(capture.views)} photographs show none of the sparse points ({_some(blind)})."
+            f"{len(blind)} of {len(capture.views)} photographs show none of the sparse points ({some_names(blind)})."
         )
 
 
@@ -170,7 +170,7 @@ def _judge_reprojection(capture: Capture, errors: dict[str, np.ndarray], median:
     if wrong:
         findings.warnings.append(
             f"the poses of {len(wrong)} of {len(capture.views)} photographs are wrong: their sparse points do not fall "
-            f"where the model says that they show them ({_some(wrong)}). Remove them from the model."
+            f"where the model says that they show them ({some_names(wrong)}). Remove them from the model."
         )
 
 
@@ -181,10 +181,6 @@ def format_reprojection(median_px: float) -> str:
 
 def _longest_side(views: Sequence[View]) -> float:
     return float(np.median([max(view.camera.width, view.camera.height) for view in views]))
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:MAX_NAMES_SHOWN]) + (", ..." if len(names) > MAX_NAMES_SHOWN else "")
 
 
 def require_trainable(capture: Capture, console: Console) -> None:

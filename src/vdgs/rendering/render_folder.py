@@ -11,6 +11,7 @@ from typing import Any
 
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json
+from vdgs.system.units import some_names
 
 MANIFEST_FILE = "render.json"
 _WRITER = "vdgs render"
@@ -29,7 +30,7 @@ def begin_render(folder: Path, names: Sequence[str]) -> list[str]:
     earlier = _listed_files(folder) & present
     foreign = sorted(present - earlier - ({MANIFEST_FILE} if _has_manifest(folder) else set()))
     if foreign:
-        shown = ", ".join(foreign[:3]) + (", ..." if len(foreign) > 3 else "")
+        shown = some_names(foreign, 3)
         raise VdgsError(
             f"{folder}: holds {len(foreign)} files or folders that no render wrote ({shown}). Give a new or an empty "
             f"folder for --output; one that `vdgs render` filled is replaced."

@@ -26,7 +26,7 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.picture_layers import picture_layers
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.quoting import check_is_text
-from vdgs.system.units import first_names
+from vdgs.system.units import first_names, some_names
 
 #: What photographs are sent and downloaded in.
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tar.xz", ".tar.zst")
@@ -74,7 +74,7 @@ class Found:
             notes.append(f"names here have _ for blanks (and a # in front): {first_names(names)}.")
         for why in dict.fromkeys(self.skipped.values()):
             names = [name for name, reason in self.skipped.items() if reason == why]
-            shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+            shown = some_names(names)
             notes.append(f"not read: {shown} ({why}).")
         return notes
 

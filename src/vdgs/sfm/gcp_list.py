@@ -30,7 +30,7 @@ from vdgs.geometry.similarity import is_collinear
 from vdgs.sfm.gcp_lines import GcpLine, parse_line, read_rows
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.system.units import first_names
+from vdgs.system.units import first_names, some_names
 
 #: Fewer points fix no place, scale and directions.
 MIN_CONTROL_POINTS = 3
@@ -218,7 +218,7 @@ def _of_photographs(
     names = list(dict.fromkeys(line.photograph for line in lines if line not in there))
     if not names:
         return there, []
-    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    shown = some_names(names)
     if not there:
         raise CaptureError(
             f"{file}: none of its {len(lines)} lines is of a photograph that is there ({shown} are not). Is it the "

@@ -23,7 +23,7 @@ from vdgs.captures.image_files import (
     read_header,
     same_aspect,
 )
-from vdgs.captures.mask_matching import mask_name
+from vdgs.captures.mask_matching import mask_name, unused_masks_note
 from vdgs.captures.strays import MASK_FOLDERS, is_mask_folder, masked_stem
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -153,8 +153,7 @@ def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) ->
                 f"({example}; {spare[0]} is there), or rename the folder if these are photographs or not to be used."
             )
         if spare:
-            shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
-            remarks.append(f"{place}: {len(spare)} masks belong to no photograph and are not used ({shown}).")
+            remarks.append(unused_masks_note(place, spare))
     without = [file for file, mask in found.items() if mask is None]
     if used and without:
         remarks.append(

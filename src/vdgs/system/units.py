@@ -75,6 +75,11 @@ def two_digits(value: float, sign: str = "") -> str:
     return f"{shown:{sign}.{min(3, max(0, 1 - power))}f}"
 
 
+def some_names(names: Sequence[str], most: int = 5) -> str:
+    """a.jpg, b.jpg, ...: at most so many."""
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+
+
 def first_names(names: Sequence[str]) -> str:
     """a.jpg, b.jpg, c.jpg and 12 more."""
     more = len(names) - 3

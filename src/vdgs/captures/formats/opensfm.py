@@ -32,6 +32,7 @@ from vdgs.geometry.crs import utm_epsg
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import rotation_about
 from vdgs.system.documents import JsonObject
+from vdgs.system.units import some_names
 
 RECONSTRUCTION, TOPOCENTRIC, REFERENCE = "reconstruction.json", "reconstruction.topocentric.json", "reference_lla.json"
 TRACKS = "tracks.csv"
@@ -199,7 +200,7 @@ def _biggest(file: Path) -> tuple[JsonObject, list[str]]:
     others = [name for each in found if each is not best for name in each["shots"]]
     if not others:
         return best, []
-    shown = ", ".join(sorted(others)[:5]) + (", ..." if len(others) > 5 else "")
+    shown = some_names(sorted(others))
     note = f"{file.name} holds {len(found)} reconstructions; the one of {len(best['shots'])} photographs is used"
     return best, [f"{note}, the other {len(others)} photographs are not ({shown})."]
 

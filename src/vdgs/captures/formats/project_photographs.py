@@ -15,6 +15,7 @@ from vdgs.captures.name_resolution import to_nfc, without_uri
 from vdgs.captures.strays import is_mask_folder, walk
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.system.units import some_names
 
 #: The folder of undistorted photographs, which are not those of a camera.
 UNDISTORTED = "undistorted"
@@ -65,7 +66,7 @@ def find_photographs(
 
 
 def _none_there(names: Sequence[tuple[str, ...]], folder: Path, images: dict[str, Path], file: Path) -> CaptureError:
-    wanted = ", ".join(each[0] for each in names[:3]) + (", ..." if len(names) > 3 else "")
+    wanted = some_names([each[0] for each in names], 3)
     have = f"holds {len(images)} others ({', '.join(list(images)[:3])}, ...)" if images else "holds no photographs"
     return CaptureError(
         f"{file}: none of its {len(names)} photographs is in {folder}, which {have}. It names {wanted}. Say which "
@@ -75,7 +76,7 @@ def _none_there(names: Sequence[tuple[str, ...]], folder: Path, images: dict[str
 
 def _names_of_their_own(alike: Sequence[tuple[str, ...]]) -> str:
     """What to do where a project has the same names for several cameras, which no choice of a folder tells apart."""
-    shown = ", ".join(each[0] for each in alike[:3]) + (", ..." if len(alike) > 3 else "")
+    shown = some_names([each[0] for each in alike], 3)
     return (
         f"The project itself has one name for several of its photographs ({shown}): give all photographs names of "
         "their own, align them under these, and export it again (of Metashape, give the .psx, or put the cameras into "
