@@ -138,10 +138,15 @@ def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_targe
         keep = masked if keep is None else masked & keep
     x, y = grid[..., 0], grid[..., 1]
     straight = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
-    write_bytes(target, cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
+    write_bytes(target, encode_jpeg(straight))
     if keep is None:
         return False
     mask = cv2.remap(keep.astype(np.uint8) * 255, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
     write_bytes(mask_target, cv2.imencode(".png", mask)[1].tobytes())
     return True
+
+
+def encode_jpeg(pixels: np.ndarray) -> bytes:
+    """A JPEG of RGB pixels [h, w, 3] uint8, with as many samples of color as of brightness."""
+    settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
+    return cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), settings)[1].tobytes()

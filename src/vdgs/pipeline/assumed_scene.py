@@ -14,10 +14,11 @@ import numpy as np
 
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.image_files import decode_image
+from vdgs.captures.undistortion import JPEG_QUALITY
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.sfm.capture_writer import IMAGE_SIZES, JPEG_QUALITY, SIDE_MULTIPLE
+from vdgs.sfm.capture_writer import IMAGE_SIZES, SIDE_MULTIPLE
 from vdgs.sfm.feature_extraction import DEFAULT_FOCAL_FACTOR
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan

@@ -17,7 +17,7 @@ from vdgs.captures.formats.colmap_writing import write_model_files
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
-from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
+from vdgs.captures.undistortion import encode_jpeg, sampling_map, undistorted_pinhole
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
@@ -30,7 +30,6 @@ from vdgs.system.stop_signals import check_stop_requested
 SIDE_MULTIPLE = 4
 #: The folders of the sizes, and by how much they are shrunk.
 IMAGE_SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
-JPEG_QUALITY = 95
 #: No perspective lens sees more degrees from corner to corner: those of 9 mm for 36 x 24 mm see 135.
 WIDEST_DEG = 138.0
 #: The folder of masks, of the largest size.
@@ -182,11 +181,10 @@ def _write_one(output: Path, workspace: Workspace, undistortion: Undistortion, n
     if straight.shape[1::-1] != undistortion.resized:
         straight = cv2.resize(straight, undistortion.resized, interpolation=cv2.INTER_AREA)
     straight = straight[: undistortion.intrinsics.height, : undistortion.intrinsics.width]
-    settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
     for target, (_, factor) in zip(targets, IMAGE_SIZES, strict=True):
         size = undistortion.intrinsics.width // factor, undistortion.intrinsics.height // factor
         small = straight if factor == 1 else cv2.resize(straight, size, interpolation=cv2.INTER_AREA)
-        write_bytes(target, cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
+        write_bytes(target, encode_jpeg(small))
 
 
 def _write_mask(output: Path, mask: Path, undistortion: Undistortion, name: str) -> None:
