@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from support.captures import look_down
-from support.mapped_house import GROUND, TOP, capture_of, model_of, surveyor_of
+from support.mapped_house import GROUND, model_of, surveyor_of
 from vdgs.captures.capture import Capture
 from vdgs.geometry.map_projection import MapProjection
 from vdgs.model.anchor_model import AnchorModel
@@ -23,12 +23,6 @@ from vdgs.rendering.ortho.pixel_grid import PixelGrid
 pytestmark = pytest.mark.slow
 
 pytest.importorskip("pyproj")
-
-
-@pytest.fixture(scope="module")
-def house() -> tuple[Capture, AnchorModel]:
-    places = np.concatenate([GROUND, TOP])
-    return capture_of(places), model_of(places)
 
 
 def pattern(places: np.ndarray) -> np.ndarray:

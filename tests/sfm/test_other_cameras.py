@@ -11,14 +11,10 @@ import pytest
 from PIL import Image
 
 from support.flights import add_xmp, write_photograph
+from support.small_flights import pixels
 from vdgs.sfm.image_list import ImageList, collect_images
 
 COUNT, SIZE, THERMAL = 5, (400, 300), (320, 256)
-
-
-def pixels(number: int, width: int, height: int) -> np.ndarray:
-    rough = np.random.default_rng(number).integers(0, 255, (height // 4, width // 4, 3), np.uint8)
-    return cv2.resize(rough, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
 def shoot(
