@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from vdgs.captures.formats.json_poses import read_capture_json
+from vdgs.captures.formats.ply_reader import GRAY
 from vdgs.captures.formats.source_capture import safe_name
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
@@ -97,8 +98,6 @@ def _shown(
 
 
 def _colors(content: JsonObject, number: int | None, count: int, file: Path) -> np.ndarray:
-    from vdgs.captures.formats.ply_reader import GRAY
-
     if number is None:
         return np.full((count, 3), GRAY, np.uint8)
     colors = _accessor(content, number, file)[:, :3]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from vdgs import __version__
 from vdgs.captures.capture import Capture
 from vdgs.captures.grazing_views import grazing_note, grazing_share
 from vdgs.captures.output_guard import check_not_among_inputs, check_output
@@ -121,8 +122,6 @@ def remove_killed(folder: Path, console: Console) -> None:
 
 def software_name() -> str:
     """What map.json calls the program that drew the files beside it."""
-    from vdgs import __version__
-
     return f"vdgs {__version__}"
 
 
