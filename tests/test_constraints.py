@@ -10,6 +10,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 CONSTRAINTS = Path(__file__).parents[1] / "constraints.txt"
+#: The CUDA whose packages the index's build of a torch needs, in versions that it names.
+CUDA_OF_TORCH = {"2.13.0": "13.0"}
 
 
 def _brought_along(package: str, extras: frozenset[str], seen: set[tuple[str, frozenset[str]]]) -> None:
@@ -27,10 +29,22 @@ def _brought_along(package: str, extras: frozenset[str], seen: set[tuple[str, fr
             _brought_along(need.name, frozenset(need.extras), seen)
 
 
+def _pinned() -> dict[str, str]:
+    pins = re.findall(r"^([\w.-]+)==(\S+)$", CONSTRAINTS.read_text(), re.MULTILINE)
+    return {canonicalize_name(name): version for name, version in pins}
+
+
 def test_every_package_that_an_installation_brings_along_is_pinned():
     seen = set[tuple[str, frozenset[str]]]()
     _brought_along("vdgs", frozenset({"test", "demo"}), seen)
-    pinned = {canonicalize_name(name) for name in re.findall(r"^([\w.-]+)==", CONSTRAINTS.read_text(), re.MULTILINE)}
+    pinned = _pinned().keys()
     needed = {name for name, _ in seen} - {"vdgs"}
     assert {"torch", "scikit-learn", "joblib"} <= needed  # the walk went somewhere
     assert needed - pinned == set()
+
+
+def test_nvrtc_is_the_one_that_torch_for_gpus_needs():
+    """With another one pip finds no solution where the index gives that torch, and `make setup` fails. The metadata of
+    a torch for processors do not tell."""
+    pinned = _pinned()
+    assert pinned["nvidia-cuda-nvrtc"].startswith(CUDA_OF_TORCH[pinned["torch"]] + ".")

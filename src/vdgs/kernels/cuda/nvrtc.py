@@ -78,11 +78,19 @@ def get_nvrtc() -> Nvrtc:
     refused = []
     for found in find_nvrtc():
         try:
-            return Nvrtc(ctypes.CDLL(found.path), found)
+            return Nvrtc(_load(Path(found.path)), found)
         except (OSError, AttributeError) as error:
             refused.append(f"{found.path} ({error})")
     tried = f" Tried: {'; '.join(refused)}." if refused else ""
     raise CudaUnavailable(f"NVRTC, the CUDA compiler library, was not found. {INSTALL_HINT}.{tried}")
+
+
+def _load(library: Path) -> ctypes.CDLL:
+    """The library, after the built-in headers beside it: it opens these by name at the first source, and some of its
+    wheels (13.0) do not look in their own folder for them."""
+    for builtins in library.parent.glob("libnvrtc-builtins.so*") if library.is_absolute() else ():
+        ctypes.CDLL(str(builtins))
+    return ctypes.CDLL(str(library))
 
 
 class Nvrtc:
