@@ -3,6 +3,7 @@
 python examples/04_train_a_capture.py CAPTURE OUTPUT [ITERATIONS]
 """
 
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +23,8 @@ def main(capture_folder: str, output: str, iterations: str = "3000") -> None:
 
     def show(event) -> None:
         if event.iteration % max(1, event.iterations // 5) == 0:
-            print(
-                f"{event.stage}: {event.iteration} of {event.iterations}, {event.psnr:.1f} dB, {event.anchors} anchors"
-            )
+            psnr = "" if math.isnan(event.psnr) else f"{event.psnr:.1f} dB, "  # measured every tenth iteration
+            print(f"{event.stage}: {event.iteration} of {event.iterations}, {psnr}{event.anchors} anchors")
 
     scene = vdgs.train(capture, settings, callbacks=[show])
     path = Path(output) / "scene.safetensors"

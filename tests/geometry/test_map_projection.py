@@ -6,6 +6,8 @@ import warnings
 import numpy as np
 import pytest
 
+from vdgs.cli.advice import Advice
+from vdgs.cli.main import verb_arguments
 from vdgs.errors import VdgsError
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_enu
 from vdgs.geometry.ground_frame import GroundFrame
@@ -234,8 +236,10 @@ def test_without_a_georeference_there_is_the_ground_frame_and_the_source(metric)
     np.testing.assert_array_equal(local.project(scattered()), scattered())
     assert MapProjection.of(ground, "source").crs == "source"
     for crs in ("enu", "EPSG:32632"):
-        with pytest.raises(VdgsError, match=r"not georeferenced.*--crs local"):
+        with pytest.raises(VdgsError, match=r"not georeferenced.*--crs local.*vdgs run CAPTURE --gps") as raised:
             MapProjection.of(ground, crs)
+        said = str(raised.value)
+        assert Advice("ortho", verb_arguments).fit(said) == said  # no verb has to say whose options these are
 
 
 def test_without_pyproj_the_remedy_is_named(monkeypatch):

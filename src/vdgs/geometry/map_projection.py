@@ -70,8 +70,8 @@ class MapProjection:
             raise VdgsError(f"--crs {name}: is no coordinate system known here. Give {CRS_CHOICES}.")
         if ground.origin_geo is None:
             raise VdgsError(
-                f"--crs {name}: the capture is not georeferenced ({ground.description}). Give positions when the run "
-                "is started (--gps TABLE.csv or --georef FILE.json), or --crs local."
+                f"--crs {name}: the capture is not georeferenced ({ground.description}). Give --crs local, "
+                "or start a run with positions: `vdgs run CAPTURE --gps TABLE.csv` or `vdgs run CAPTURE --georef JSON`."
             )
         return _enu(ground) if name.lower() == "enu" else _projected(ground, open_crs(name, ground.origin_geo))
 
