@@ -162,7 +162,7 @@ def test_a_row_of_units_below_the_headings_counts(tmp_path, units):
 )  # fmt: skip
 def test_accuracies_are_known_by_the_words_of_their_headings(tmp_path, across, upwards):
     """One of them alone is not read, and a note names it; accelerations and residuals are none."""
-    table = f"name,lat,lon,alt,accX,X_error,yaw accuracy,{{}}\na.jpg,-33.5,-70.6,500,9,8,7,{{}}\n"
+    table = "name,lat,lon,alt,accX,X_error,yaw accuracy,{}\na.jpg,-33.5,-70.6,500,9,8,7,{}\n"
     (file := tmp_path / "t.csv").write_text(table.format(f"{across},{upwards}", "0.5,1.0"), encoding="utf-8")
     read = read_gps_table(file)
     assert (read.rows[0].gps_std, read.notes) == ((0.5, 1.0), ())

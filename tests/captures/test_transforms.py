@@ -16,6 +16,7 @@ from support.captures import (
     to_source,
     write_colmap,
     write_images,
+    write_ply,
 )
 from support.dataset_layouts import (
     write_transforms,
@@ -242,6 +243,24 @@ def shifted_by_nerfstudio() -> np.ndarray:
     applied[2] *= -1
     applied[:3, 3] = [1.0, 2.0, 3.0]
     return applied
+
+
+@pytest.mark.parametrize("is_named", [False, True])
+def test_a_cloud_in_the_world_before_applied_transform_is_brought_over(tmp_path, scene, is_named):
+    """As COLMAP has it; one of another place is refused."""
+    write_transforms(tmp_path, scene, shifted_by_nerfstudio())
+    cloud = tmp_path / "sparse_pc.ply"
+    if not is_named:
+        content = json.loads((tmp_path / "transforms.json").read_text())
+        del content["ply_file_path"]
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    write_ply(cloud, scene.points, scene.colors)
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert any("in the world before applied_transform" in note for note in capture.warnings)
+    np.testing.assert_allclose(to_source(capture.ground, capture.points), scene.points, atol=1e-5)
+    write_ply(cloud, scene.points + np.array([5e3, 0, 0]), scene.colors)
+    with pytest.raises(CaptureError, match=r"not where the cameras look .*world of the poses(?s:.)*vdgs sfm"):
+        load_capture(tmp_path)
 
 
 def test_a_model_beside_transforms_json_is_read_and_told(tmp_path, scene):

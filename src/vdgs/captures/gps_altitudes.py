@@ -20,8 +20,8 @@ LEAST_RELIEF_M = 2.5
 #: usual one do not count there.
 ENOUGH_TILTED, LEFT_OUT_TIMES = 5, 5.0
 #: Heights must still differ by this share of the least relief without what a tilt explains (choice), and the
-#: factor be that of the unit within this share.
-LEAST_TILTED, SAME_FACTOR = 0.6, 0.1
+#: factor be that of the unit within this share; so much of the variance may be left (choices).
+LEAST_TILTED, SAME_FACTOR, UNEXPLAINED = 0.5, 0.15, 0.2
 
 #: Altitudes are heights over the ground where they spread by less than this share of what the photographs' heights do,
 #: and lie across those by so many times what up may be off by, and so many degrees (choice).
@@ -89,9 +89,9 @@ def _differ_times(factor: float, altitudes: np.ndarray, heights: np.ndarray, acr
 
 
 def _differ_times_tilted(factor: float, altitudes: np.ndarray, heights: np.ndarray, across: np.ndarray) -> bool:
-    """Whether a line through what planes over `across` [n, 2] leave of altitudes and heights [n] has the slope `factor`,
-    and explains nearly all of those altitudes. A drift with time is no unknown of its own: beside a tilt it would take
-    up heights, too."""
+    """Whether a line through what planes over `across` [n, 2] leave of altitudes and heights [n] has a slope
+    of `factor` and explains nearly all of those altitudes. A drift with time is no unknown of its own: beside a tilt it
+    would take up heights, too."""
     unknowns = np.column_stack([np.ones(len(heights)), across - across.mean(axis=0)])
     unknowns /= np.maximum(np.abs(unknowns).max(axis=0), 1e-300)
     which = np.ones(len(heights), bool)
@@ -103,12 +103,12 @@ def _differ_times_tilted(factor: float, altitudes: np.ndarray, heights: np.ndarr
         found = float(left[which, 0] @ left[which, 1] / max(left[which, 1] @ left[which, 1], 1e-300))
         off = np.abs(left[:, 0] - found * left[:, 1])
         is_near = off <= LEFT_OUT_TIMES * np.median(off[which])
-        explained, differ = np.sum(off[which] ** 2) / max(np.sum(left[which, 0] ** 2), 1e-300), np.ptp(left[which, 1])
+        left_over, differ = np.sum(off[which] ** 2) / max(np.sum(left[which, 0] ** 2), 1e-300), np.ptp(left[which, 1])
         if (is_near == which).all():
             break
         which = is_near
     is_factor = abs(found / factor - 1) < SAME_FACTOR
-    return bool(is_factor and explained < SAME_RELIEF and differ >= LEAST_TILTED * LEAST_RELIEF_M)
+    return bool(is_factor and left_over < UNEXPLAINED and differ >= LEAST_TILTED * LEAST_RELIEF_M)
 
 
 def refuse_unit(unit: str, whose: str, file: Path) -> None:

@@ -38,8 +38,8 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "latref": "latref latituderef gpslatituderef",
         "lonref": "lonref longituderef gpslongituderef",
         "altref": "altref altituderef gpsaltituderef",
-        "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror horzerror accuracyxy errorxy "
-        "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy sdh stdh hrms hstd",
+        "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror horzerror accuracyxy "
+        "errorxy gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy sdh stdh hrms hstd",
         "eastwards": "rmsx stdx sdx sigmax xrms "
         "longitudeacc lonacc xacc eastingacc rmseasting eastingrms sde stddeve sigmae accuracyxeasting "
         "accuracyxlongitude accuracyx",

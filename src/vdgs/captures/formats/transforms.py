@@ -7,12 +7,14 @@ world is the original one, so that georeferences hold.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 
 from vdgs.captures.capture import Split
+from vdgs.captures.formats.cloud_worlds import CloudFrame, Eye, in_world_of
 from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
@@ -32,6 +34,7 @@ from vdgs.captures.formats.source_capture import (
     find_image,
     leave_out_bad_poses,
     one_view_each,
+    points_command,
     refuse_lost_tests,
     refuse_many_missing,
     safe_name,
@@ -123,7 +126,12 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
-    points, colors = _points(root, content, file, poses, options.images, needs_points, warnings)
+    eyes = [Eye(poses[view.name], view.intrinsics) for view in views]
+
+    def placed(points: np.ndarray, cloud: Path) -> np.ndarray:
+        return in_world_of(points, cloud, eyes, applied.cloud_frames(), warnings, _remedy(root, options))
+
+    points, colors = _points(root, content, file, poses, options.images, needs_points, warnings, placed)
     return SourceCapture(
         source="transforms",
         images=chosen,
@@ -132,6 +140,13 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
         colors=colors,
         image_folders=(root / chosen,) if chosen else (),
         warnings=tuple(warnings),
+    )
+
+
+def _remedy(root: Path, options: CaptureOptions) -> str:
+    return (
+        "Write it in the world of the poses (or name no ply_file_path and move it away), or find points anew: "
+        f"{points_command(root, options.images)}"
     )
 
 
@@ -240,6 +255,20 @@ class _Applied(NamedTuple):
         unscaled[:3, 3] /= self.scale
         return self.original_from_world @ unscaled
 
+    def cloud_frames(self) -> list[CloudFrame]:
+        """Coordinates other than those of the file that a point cloud may have, and what brings them there."""
+        turn, shift = self.original_from_world[:3, :3], self.original_from_world[:3, 3]
+        if self.scale == 1 and np.allclose(self.original_from_world, np.eye(4)):
+            return []
+        return [
+            (
+                "in the world before applied_transform (and applied_scale)",
+                lambda points: (points - shift) @ turn * self.scale,
+            ),
+            ("in the world before applied_scale", lambda points: points * self.scale),
+            ("in the world before applied_transform, but scaled", lambda points: (points - self.scale * shift) @ turn),
+        ]
+
     def undo_places(self, places: np.ndarray) -> np.ndarray:
         """Places [n, 3] in the original world."""
         turn, shift = self.original_from_world[:3, :3], self.original_from_world[:3, 3]
@@ -266,6 +295,7 @@ def _points(
     images: str | None,
     needs_points: bool,
     notes: list[str],
+    placed: Callable[[np.ndarray, Path], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
@@ -274,10 +304,13 @@ def _points(
     except CaptureError as error:
         raise CaptureError(f"{error} Or put the point cloud beside it, by the same name.") from error
     if cloud is not None and cloud.is_file():
-        return read_point_cloud(cloud)
+        points, colors = read_point_cloud(cloud)
+        return placed(points, cloud), colors
     what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
     option = " and give --format transforms"
-    found = find_sparse_points(root, poses, what, option=option, images=images, needs_points=needs_points)
+    found = find_sparse_points(
+        root, poses, what, option=option, images=images, needs_points=needs_points, placed=placed
+    )
     if cloud is not None and len(found[0]):
         notes.append(
             f"{cloud}: is not there, though {TRANSFORMS_FILE} names it; {len(found[0]):,} points beside it are used."
