@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -235,6 +236,35 @@ def test_photographs_of_other_folders_are_found_where_a_person_says(tmp_path, sc
     assert [view.name for view in capture.test_views] == sorted(scene.cameras)[2:4]
     (tmp_path / "photographs" / "frame_011.png").unlink()
     assert any("1 of 12 images" in note for note in load_capture(tmp_path / "nerf", options).warnings)
+
+
+def test_photographs_in_a_folder_of_another_name_are_found_and_told(tmp_path, scene):
+    """Not among masks, and not where each name is there twice."""
+    write_transforms(tmp_path, scene)
+    (tmp_path / "images").rename(tmp_path / "masks")
+    with pytest.raises(CaptureError, match="are missing"):
+        load_capture(tmp_path)
+    (tmp_path / "masks").rename(tmp_path / "photos")
+    capture = load_capture(tmp_path)
+    assert capture.images == "photos"
+    assert any("images/frame_000.png is taken as photos/frame_000.png" in note for note in capture.warnings)
+    assert_sees_the_scene(capture, scene)
+    shutil.copytree(tmp_path / "photos", tmp_path / "others")
+    with pytest.raises(CaptureError, match=r"may be others/frame_000\.png or photos/.*--images"):
+        load_capture(tmp_path)
+
+
+def test_paths_as_in_a_uri_are_those_of_files_with_blanks(tmp_path, scene):
+    """Where the file is not there as it is written; names with a percent sign stay."""
+    named = {f"a%20{k}.png" if k == 5 else f"a {k}.png": camera for k, camera in enumerate(scene.cameras.values())}
+    content = write_transforms(tmp_path, replace(scene, cameras=named))
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace(" ", "%20")
+    content["test_filenames"] = [content["frames"][k]["file_path"] for k in (3, 5)]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = load_capture(tmp_path)
+    assert {view.name for view in capture.views} == set(named)
+    assert {view.name for view in capture.test_views} == {"a 3.png", "a%205.png"}
 
 
 def shifted_by_nerfstudio() -> np.ndarray:
