@@ -32,8 +32,9 @@ _ROUNDED_DEG = 1e-5
 #: Photographs show the same where the order of the gray values of their pixels correlates so well, by so many of them
 #: (choice; five aerial photographs and themselves moved by 2 % of the width: 0.54 to 0.92).
 SAME_PICTURE, LOOKED_AT_PAIRS = 0.95, 3
-#: And are one that was saved again from so much on (choice; quality 30 of a JPEG: 0.998).
-SAVED_AGAIN = 0.995
+#: And are one that was saved again from so much on (choice; photographs of 400 pixels as JPEG of quality 30:
+#: from 0.992; moved by one pixel: up to 0.974).
+SAVED_AGAIN = 0.99
 #: A picture that was cut from another is looked for in so small a one, in so many sizes, and found where gray values
 #: correlate so well (choice: every size is within a few per cent of one that is tried).
 _SEARCHED_PX, _SEARCHED_SIZES, _SAME_PART = 320, 24, 0.8
@@ -238,7 +239,15 @@ def _kind_of_name(photo: ImageMetadata) -> str:
 def _is_saved_again(photo: ImageMetadata, first: ImageMetadata) -> bool:
     if _kind_of_name(photo) == _kind_of_name(first) or (photo.lat_lon is None) != (first.lat_lon is None):
         return False
+    if _are_of_two_lenses(*(PurePosixPath(each.name).stem for each in (photo, first))):
+        return False
     return _is_one_exposure(first, photo) and _alike(first, photo) >= SAVED_AGAIN
+
+
+def _are_of_two_lenses(one: str, other: str) -> bool:
+    """Whether stems have a number in common and an ending each, as of lenses and bands: DJI_0001_W and DJI_0001_Z."""
+    count = next((k for k, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
+    return any(map(str.isdigit, one[:count])) and count < min(len(one), len(other))
 
 
 def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
