@@ -80,7 +80,8 @@ def in_world_of(
     if seen < LEAST_SEEN:
         raise CaptureError(
             f"{cloud}: its points are not where the cameras look ({seen:.0%} fall into photographs): it is in other "
-            f"coordinates, or of another place. {remedy}"
+            "coordinates, or of another place, or the poses are of another convention (OpenCV's axes in place of "
+            f"OpenGL's axes, camera-from-world in place of world-from-camera). {remedy}"
         )
     return points
 
