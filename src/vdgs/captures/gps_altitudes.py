@@ -18,10 +18,10 @@ SAME_RELIEF = 0.1
 LEAST_RELIEF_M = 2.5
 #: So many photographs more than unknowns tell a unit beside a tilt (choice); residuals so many times the
 #: usual one do not count there.
-ENOUGH_TILTED, LEFT_OUT_TIMES = 5, 5.0
+ENOUGH_TILTED, LEFT_OUT_TIMES = 8, 5.0
 #: Heights must still differ by this share of the least relief without what a tilt explains (choice), and the
 #: factor be that of the unit within this share; so much of the variance may be left (choices).
-LEAST_TILTED, SAME_FACTOR, UNEXPLAINED = 0.5, 0.15, 0.2
+LEAST_TILTED, SAME_FACTOR, UNEXPLAINED = 0.5, 0.1, 0.15
 
 #: Altitudes are heights over the ground where they spread by less than this share of what the photographs' heights do,
 #: and lie across those by so many times what up may be off by, and so many degrees (choice).
