@@ -53,6 +53,7 @@ def write_names(path: Callable[[str], str]) -> Change:
         (lambda name: "C:\\Users\\me\\" + name, ".png"),
         (lambda name: f"/home/me/set/{name}", ".png"),
         (lambda name: f"file:///home/me/set/{name}", ".png"),
+        (lambda name: name.replace("0", "%30"), ".png"),
         (lambda name: f"../{name}".replace("/", "\\"), ".png"),
     ],
 )

@@ -56,6 +56,23 @@ def test_mega_nerf(tmp_path, scene, points):
     np.testing.assert_allclose(back, scene.points - np.median(scene.points, axis=0), atol=1e-3)
 
 
+def test_a_cloud_of_mega_nerf_may_be_in_the_world_of_its_poses(tmp_path, scene):
+    """Photographs tell which, and a note says it; a cloud of another place is refused."""
+    write_mega_nerf(tmp_path, scene)
+    there = torch.load(tmp_path / "coordinates.pt", weights_only=True)
+    origin, scale = there["origin_drb"].numpy(), float(there["pose_scale_factor"])
+    down = scene.points @ DRB.T
+    for points, said in ((down, ""), ((down - origin) / scale, "in the world of its poses"), (down / scale, "divided")):
+        write_ply(tmp_path / "points3D.ply", points, scene.colors)
+        capture = load_capture(tmp_path)
+        assert any(said and said in note for note in capture.warnings) is bool(said)
+        back = capture.points - np.median(capture.points, axis=0)
+        np.testing.assert_allclose(back, scene.points - np.median(scene.points, axis=0), atol=1e-3)
+    write_ply(tmp_path / "points3D.ply", down + np.array([0, 5e3, 0]), scene.colors)
+    with pytest.raises(CaptureError, match=r"not where the cameras look .*in metres, x down(?s:.)*vdgs sfm"):
+        load_capture(tmp_path)
+
+
 def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
     write_mega_nerf(tmp_path, scene)
     with pytest.raises(CaptureError, match=r"brings no 3D points(?s:.)*points3D\.ply"):

@@ -101,6 +101,21 @@ def test_points_in_wkt_are_positions(tmp_path):
         assert rows[1].position == (47.1, 8.501, 500.0)
 
 
+@pytest.mark.parametrize(
+    ("heading", "point", "rest", "altitude"),
+    [
+        ("name,geom", "POINT Z (8.5 47.1 512)", "", 512), ("name,geom", "POINT (8.5 47.1 512)", "", 512),
+        ("name,geom", "POINTZM(8.5 47.1 512 7)", "", 512), ("name,geom", "POINT M (8.5 47.1 7)", "", None),
+        ("name,geom,alt", "POINT Z (8.5 47.1 0)", ",512", 512), ("name,geom", "POINT (8.5 47.1)", "", None),
+    ],
+)  # fmt: skip
+def test_the_third_number_of_a_point_is_an_altitude_where_there_is_no_other(tmp_path, heading, point, rest, altitude):
+    rows = [f'{k}.jpg,"{point.replace("8.5", f"8.50{k}")}"{rest}' for k in range(3)]
+    (file := tmp_path / "t.csv").write_text("\n".join([heading, *rows]))
+    read = read_gps_table(file).rows[0].position
+    assert read == pytest.approx((47.1, 8.5, np.nan if altitude is None else altitude), nan_ok=True)
+
+
 @pytest.mark.parametrize(("east", "north"), [("0.5", ""), ("", "0.5"), ("-", "0.5")])
 def test_an_accuracy_without_its_other_side_or_in_degrees_is_not_believed(tmp_path, east, north):
     for unit, sides in (("m", (east, north)), ("°", ("0.5", "0.5"))):

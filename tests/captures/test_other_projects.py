@@ -13,6 +13,7 @@ import pyproj
 import pytest
 
 from support import project_writers as writers
+from support.captures import write_ply
 from support.known_flight import (
     BentLens,
     EquidistantLens,
@@ -367,6 +368,18 @@ def test_heights_of_pix4d_have_the_unit_of_its_system(tmp_path: Path, flight: Kn
     check_numbers(source, flight)
     assert source.georef is not None
     assert "x, y and heights in feet" in source.georef.method
+
+
+def test_a_dense_cloud_of_pix4dmapper_is_found_where_it_writes_it(tmp_path: Path, flight: KnownFlight) -> None:
+    writers.write_pix4d(tmp_path / "flight", flight)
+    flight.write_photographs(tmp_path / "images")
+    _, _, points, _ = writers.utm_flight(flight, 1.0)
+    dense = tmp_path / "flight" / "2_densification" / "point_cloud"
+    dense.mkdir(parents=True)
+    write_ply(dense / "flight_group1_densified_point_cloud.ply", points, flight.colors)
+    source = read_source(tmp_path, CaptureOptions())
+    assert len(source.points) == len(flight.points)
+    assert any("densified_point_cloud.ply are used" in note for note in source.warnings)
 
 
 def test_parameters_of_pix4dmapper_are_read_to_their_numbers(tmp_path: Path, flight: KnownFlight) -> None:

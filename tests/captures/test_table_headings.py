@@ -152,6 +152,31 @@ def test_a_row_of_units_below_the_headings_counts(tmp_path, units):
     assert not read.notes
 
 
+@pytest.mark.parametrize(
+    ("across", "upwards"),
+    [
+        ("Accuracy Horz [m]", "Accuracy Vert [m]"), ("hz accuracy", "vert. accuracy"), ("水平精度", "高程精度"),
+        ("horizontal RMS", "vertical RMS (m)"), ("GPS accuracy horizontal", "altitude accuracy"),
+        ("Genauigkeit Lage", "Genauigkeit Höhe"), ("std_xy", "std_up"), ("GPSHPositioningError", "sigma_z"),
+    ],
+)  # fmt: skip
+def test_accuracies_are_known_by_the_words_of_their_headings(tmp_path, across, upwards):
+    """One of them alone is not read, and a note names it; accelerations and residuals are none."""
+    table = "name,lat,lon,alt,accX,X_error,yaw accuracy,{}\na.jpg,-33.5,-70.6,500,9,8,7,{}\n"
+    (file := tmp_path / "t.csv").write_text(table.format(f"{across},{upwards}", "0.5,1.0"), encoding="utf-8")
+    read = read_gps_table(file)
+    assert (read.rows[0].gps_std, read.notes) == ((0.5, 1.0), ())
+    for alone, missing in ((across, "add accuracy_vertical"), (upwards, "add accuracy_horizontal")):
+        file.write_text(table.format(alone, "0.5"), encoding="utf-8")
+        read = read_gps_table(file)
+        assert read.rows[0].gps_std is None
+        assert len(read.notes) == 1
+        assert f"{alone!r}: not read" in read.notes[0]
+        assert missing in read.notes[0]
+    file.write_text(table.format("accuracy", "0.5"), encoding="utf-8")
+    assert "'accuracy': not read" in read_gps_table(file).notes[0]
+
+
 @pytest.mark.parametrize("number", ["350\u00a0000,12", "350\u202f000,12", "350 000,12", "350'000.12", "350.000,12"])
 def test_signs_between_thousands_are_those_of_any_country(number):
     assert number_of(number) == 350000.12

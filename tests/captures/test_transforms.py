@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from support.captures import (
     to_source,
     write_colmap,
     write_images,
+    write_ply,
 )
 from support.dataset_layouts import (
     write_transforms,
@@ -236,12 +238,59 @@ def test_photographs_of_other_folders_are_found_where_a_person_says(tmp_path, sc
     assert any("1 of 12 images" in note for note in load_capture(tmp_path / "nerf", options).warnings)
 
 
+def test_photographs_in_a_folder_of_another_name_are_found_and_told(tmp_path, scene):
+    """Not among masks, and not where each name is there twice."""
+    write_transforms(tmp_path, scene)
+    (tmp_path / "images").rename(tmp_path / "masks")
+    with pytest.raises(CaptureError, match="are missing"):
+        load_capture(tmp_path)
+    (tmp_path / "masks").rename(tmp_path / "photos")
+    capture = load_capture(tmp_path)
+    assert capture.images == "photos"
+    assert any("images/frame_000.png is taken as photos/frame_000.png" in note for note in capture.warnings)
+    assert_sees_the_scene(capture, scene)
+    shutil.copytree(tmp_path / "photos", tmp_path / "others")
+    with pytest.raises(CaptureError, match=r"may be others/frame_000\.png or photos/.*--images"):
+        load_capture(tmp_path)
+
+
+def test_paths_as_in_a_uri_are_those_of_files_with_blanks(tmp_path, scene):
+    """Where the file is not there as it is written; names with a percent sign stay."""
+    named = {f"a%20{k}.png" if k == 5 else f"a {k}.png": camera for k, camera in enumerate(scene.cameras.values())}
+    content = write_transforms(tmp_path, replace(scene, cameras=named))
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace(" ", "%20")
+    content["test_filenames"] = [content["frames"][k]["file_path"] for k in (3, 5)]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = load_capture(tmp_path)
+    assert {view.name for view in capture.views} == set(named)
+    assert {view.name for view in capture.test_views} == {"a 3.png", "a%205.png"}
+
+
 def shifted_by_nerfstudio() -> np.ndarray:
     """A world_from_source of ns-process-data, and more than its turn of axes."""
     applied = np.eye(4)[[0, 2, 1, 3]]
     applied[2] *= -1
     applied[:3, 3] = [1.0, 2.0, 3.0]
     return applied
+
+
+@pytest.mark.parametrize("is_named", [False, True])
+def test_a_cloud_in_the_world_before_applied_transform_is_brought_over(tmp_path, scene, is_named):
+    """As COLMAP has it; one of another place is refused."""
+    write_transforms(tmp_path, scene, shifted_by_nerfstudio())
+    cloud = tmp_path / "sparse_pc.ply"
+    if not is_named:
+        content = json.loads((tmp_path / "transforms.json").read_text())
+        del content["ply_file_path"]
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+    write_ply(cloud, scene.points, scene.colors)
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert any("in the world before applied_transform" in note for note in capture.warnings)
+    np.testing.assert_allclose(to_source(capture.ground, capture.points), scene.points, atol=1e-5)
+    write_ply(cloud, scene.points + np.array([5e3, 0, 0]), scene.colors)
+    with pytest.raises(CaptureError, match=r"not where the cameras look .*world of the poses(?s:.)*vdgs sfm"):
+        load_capture(tmp_path)
 
 
 def test_a_model_beside_transforms_json_is_read_and_told(tmp_path, scene):

@@ -140,7 +140,7 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
         ({"frames": []}, "none"),
         ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
         ({"frames": [frame(np.diag([2.0, 1, 1, 1]))]}, r"orthonormal \(scaled or sheared\).*Blender.*Ctrl-A"),
-        ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the capture.*--images FOLDER"),
+        ({"frames": [frame(np.eye(4), "../gone.png")]}, "inside the capture.*--images FOLDER"),
         ({"frames": [frame(np.eye(4), "images/no.png")]}, r"1 of 1 images .* are missing(?s:.)*no\.png"),
         ({"fl_x": "wide"}, "finite number"),
         ({"fl_x": -3.0, "fl_y": -3.0}, "focal length"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vdgs.captures.gps_altitudes import wrong_reading
+from vdgs.captures.gps_altitudes import wrong_reading, wrong_unit
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up, settle
 from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.up_axis import VIEWS_DEG, up_by_views
@@ -231,6 +231,21 @@ def test_altitudes_in_feet_or_of_the_wrong_sign_are_named_by_what_they_differ_by
     assert apart == pytest.approx(off, rel=0.05)
     assert wrong_reading(heights + np.repeat([0, 12.0], 10), heights) == ("", 0.0)
     assert wrong_reading(factor * np.full(20, 500.0), np.full(20, 30.0)) == ("", 0.0)
+
+
+@pytest.mark.parametrize("drift_m", [0.0, -4.0])
+def test_altitudes_in_feet_are_named_whatever_they_tilt(drift_m):
+    """12 photographs at 42 m and 4 at 45 m; views are good to a degree. Those in metres are never named."""
+    x, y, times = 20.0 * (np.arange(16) % 4), 20.0 * (np.arange(16) // 4), np.linspace(0, 1, 16)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        places = np.stack([x, y, np.repeat([42.0, 45.0], [12, 4]) + rng.normal(0, 0.4, 16)], axis=1)
+        recorded = places + np.outer(drift_m * times, [0, 0, 1]) + rng.normal(0, 0.1, places.shape)
+        for factor, said in ((1 / 0.3048, "feet"), (1.0, "")):
+            altitudes = factor * (recorded[:, 2] + 500)
+            fit = fit_of(places, np.column_stack([recorded[:, :2], altitudes - altitudes[0]]), views(1.0))
+            assert wrong_unit(altitudes, fit.placed[:, 2], fit.placed[:, :2]) == said
+            assert wrong_reading(altitudes, fit.placed[:, 2], fit.placed[:, :2])[0].endswith(said)
 
 
 @pytest.mark.parametrize("datum_m", [-20.0, 20.0])

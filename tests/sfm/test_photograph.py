@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, WIDTH, add_xmp, write_photograph
-from vdgs.captures.reconstruction import excluded_lines
+from vdgs.captures.reconstruction import CameraReport, excluded_lines
 from vdgs.captures.xmp_packets import MAX_XMP_BYTES
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
@@ -30,7 +30,7 @@ from vdgs.sfm.image_metadata import (
     attitude_from_gimbal,
     read_image_metadata,
 )
-from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.incremental_mapper import TAGS_DISAGREE, should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
@@ -330,6 +330,24 @@ def test_the_height_over_the_median_point_is_compared_where_views_show_the_groun
     """Of a facade that point is a wall's."""
     found = _warnings((), True, height=0.3, recorded=12.5, turned=1.0, tilt=tilt)
     assert bool(found) == said
+
+
+@pytest.mark.parametrize(
+    ("why", "recorded", "said", "held"),
+    [
+        ("", None, "if heights look wrong, hold it", True), ("", 45.3, "the tag seems to be wrong", False),
+        ("", 38.5, "if heights look wrong, hold it", True), (TAGS_DISAGREE, None, "contradict each other", True),
+        (TAGS_DISAGREE, 45.3, "the tag seems to be wrong", False),
+    ],
+)  # fmt: skip
+def test_a_fitted_focal_length_that_the_flying_height_confirms_is_not_to_be_held(why, recorded, said, held):
+    camera = CameraReport(
+        name="DJI", photographs=12, width=400, height=300, focal_before_px=290.0, focal_source="EXIF",
+        focal_after_px=339.0, radial_distortion=0.0,
+    )  # fmt: skip
+    note, *_ = _warnings([camera], (False, why), 45.1, recorded, None, 1.2)
+    assert said in note
+    assert ("--focal fixed" in note) is held
 
 
 @pytest.mark.parametrize("recorded", [70.0, None])

@@ -204,6 +204,38 @@ def test_edited_versions_in_another_folder_under_another_name_are_left_out(tmp_p
         assert all("another version of card/DJI_" in each.reason for each in found.excluded)
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "left_out"),
+    [
+        ("edit_{}.jpg", "", True), ("{}_q80.jpg", "", True), ("edit_{}.png", "", True), ("{}_W.JPG", "", True),
+        ("edit_{}.jpg", "moved", False), ("edit_{}.jpg", "another place", False), ("edit_{}.jpg", "exposure", False),
+        ("DJI_1{}.JPG", "", False),
+    ],
+)  # fmt: skip
+def test_photographs_that_were_saved_again_beside_the_first_are_left_out(tmp_path, name, change, left_out):
+    """By what they show, under a name of another kind; not what a drone took at the same second and named so."""
+    for k, first in enumerate(flight(tmp_path)):
+        with Image.open(tmp_path / first) as image:
+            exif, shown = image.getexif(), np.asarray(image)
+        if k > 2:
+            continue
+        if change == "moved":
+            shown = np.roll(shown, 4, axis=1)
+        elif change == "another place":
+            exif.get_ifd(0x8825)[2] = (33.0, 31.0, 0.0)
+        elif change == "exposure":
+            for each, time in ((first, 0.01), (None, 0.04)):
+                exif.get_ifd(0x8769).update({0x829A: time, 0x829D: 2.8, 0x8827: 100})
+                if each:
+                    picture(tmp_path / each, shown, exif=exif)
+        called = name.format(first.removesuffix(".JPG") if name.startswith("{") else k)
+        picture(tmp_path / called, shown, quality=80, exif=exif)
+    found = collect_images([tmp_path])
+    assert len(found.images) == COUNT + (0 if left_out else 3)
+    assert all(re.match("is a copy of DJI_", each.reason) for each in found.excluded)
+    assert len(found.excluded) == (3 if left_out else 0)
+
+
 @pytest.mark.parametrize("counted", ["20260601_100000-1", "20260601_100000(0)", "20260601_100000_1"])
 @pytest.mark.parametrize("subseconds", [None, ("000", "500")])
 def test_photographs_of_one_second_are_no_copies_of_each_other(tmp_path, counted, subseconds):

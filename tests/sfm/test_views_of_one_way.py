@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -166,3 +167,23 @@ def test_views_that_positions_tell_from_a_wall_say_up_as_well_as_views_that_look
         assert placed.accuracy is not None
         assert up_off_deg(placed) < min(6.0, placed.accuracy.level_deg)
         assert placed.accuracy.level_deg < 20
+
+
+def test_altitudes_of_a_table_in_feet_are_refused_and_those_of_exif_are_named():
+    """As the cameras tell, whatever the views say of level."""
+    x, y = np.meshgrid(np.arange(4) * 18.0, np.arange(5) * 16.0)
+    up = np.where(np.arange(20) % 7 < 5, 42.0, 45.0) + np.random.default_rng(0).normal(0, 0.4, 20)
+    places = np.column_stack([x.ravel(), y.ravel(), up])
+    ground = np.random.default_rng(1).uniform([-30, -30, -0.2], [90, 90, 0.2], (400, 3))
+    for heights, is_feet in ((up, False), (up / 0.3048, True)):
+        model, photographs, positions = taken_from(places, ground, (0.0, -90.0), wrong_m=0.1, heights=heights)
+        placed = georegister(model, photographs, positions)
+        assert isinstance(placed, Georegistration)
+        assert placed.accuracy is not None
+        assert any("in feet" in note for note in placed.notes) is is_feet
+        assert (placed.accuracy.place_m[1] > 300) is is_feet
+        table = replace(positions, table=Path("gps.csv"), source="gps.csv")
+        if is_feet:
+            with pytest.raises(CaptureError, match=r"gps\.csv: its altitudes are in feet .* as the cameras tell"):
+                georegister(model, photographs, table)
+        assert isinstance(georegister(model, photographs, table, anyway=is_feet), Georegistration)

@@ -211,8 +211,9 @@ def _fit_table(problem: Problem, altitudes: np.ndarray, file: Path, warnings: li
             f"{np.ptp(heights):.0f} m: left out; up is by the views, heights count from the median point."
         )
         return fit_positions(replace(problem, has_altitudes=False))
+    if problem.has_altitudes:
+        refuse_unit(wrong_unit(altitudes, heights, fit.placed[:, :2]), "the cameras", file)
     if fit.altitude in ("unused", "drifts"):
-        refuse_unit(wrong_unit(altitudes, heights), "the cameras", file)
         warnings.append(f"{file.name}: its altitudes drift or are of no use, and were left out; up is by the views.")
     elif fit.altitude == "none":
         warnings.append(f"{file.name}: it has no altitudes; up is by the views, heights count from the median point.")

@@ -38,20 +38,44 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "latref": "latref latituderef gpslatituderef",
         "lonref": "lonref longituderef gpslongituderef",
         "altref": "altref altituderef gpsaltituderef",
-        "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror accuracyxy errorxy "
-        "gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy sdh stdh hrms hstd",
+        "across": "accuracyhorizontal horizontalaccuracy hacc accuracyh hdev horizontalerror horzerror accuracyxy "
+        "errorxy gpshpositioningerror accuracyhorz horizontalaccuracym hzaccuracy xyaccuracy sdh stdh hrms hstd",
         "eastwards": "rmsx stdx sdx sigmax xrms "
         "longitudeacc lonacc xacc eastingacc rmseasting eastingrms sde stddeve sigmae accuracyxeasting "
         "accuracyxlongitude accuracyx",
         "northwards": "rmsy stdy sdy sigmay yrms "
         "latitudeacc latacc yacc northingacc rmsnorthing northingrms sdn stddevn sigman accuracyynorthing "
         "accuracyylatitude accuracyy",
-        "upwards": "accuracyvertical verticalaccuracy vacc accuracyv vdev verticalerror accuracyz errorz "
+        "upwards": "accuracyvertical verticalaccuracy vacc accuracyv vdev verticalerror verterror accuracyz errorz "
         "verticalaccuracym zaccuracy sdv stdv vrms vstd altitudeacc altacc zacc heightacc "
         "rmsz stdz sdz sigmaz zrms rmselevation elevationrms sdu stddevu sigmau accuracyzaltitude",
         "system": "epsg crs srs epsgcode csname coordinatesystem",
     }.items()
 }  # fmt: skip
+#: Accuracies by the words that their headings are made of, beside the names above. Errors of x, y and z are none: they
+#: are what an adjustment left (Metashape); `acc` with these may be accelerations.
+_ACCURACY = (
+    "accuracy|std|stdev|stddev|sigma|rms|rmse|deviation|uncertainty|precision|genauigkeit|precisione|precisao|"
+    "exactitud|精度"
+)
+_SIDES_OF_ACCURACY = {
+    "across": ("horizontal|horiz|horz|hor|hz|2d|planimetric|lage|orizzontale|水平|平面", "xy|h|en|ne"),
+    "upwards": (
+        "vertical|vert|ver|altitude|alt|height|elevation|elev|ele|hohe|hoehe|vertikal|verticale|垂直|高程",
+        "z|v|u|up",
+    ),
+    "eastwards": ("east|easting|longitude|lon|lng", "x|e"),
+    "northwards": ("north|northing|latitude|lat", "y|n"),
+}
+_ACCURACIES = {
+    what: re.compile(
+        f"(?:gps|gnss|rtk|position)?(?:(?:{_ACCURACY}|acc)(?:[xyz])?(?:{words})|(?:[xyz])?(?:{words})(?:{_ACCURACY}|acc)|"
+        f"(?:{_ACCURACY})(?:{letters})|(?:{letters})(?:{_ACCURACY}))m?"
+    )
+    for what, (words, letters) in _SIDES_OF_ACCURACY.items()
+}
+#: Headings of accuracies that do not say along which axis, and of others (`stdev`) that seem to.
+_BARE_ACCURACY = re.compile(f"(?:gps|gnss|rtk|position)?(?:{_ACCURACY}|acc)m?")
 #: How names of pictures end.
 _PICTURES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
 #: Names of columns of moments.
@@ -109,13 +133,22 @@ def known_columns(words: Sequence[str]) -> dict[str, int]:
     for k, word in enumerate(words):
         heading = read_heading(word)
         names = {heading.plain, heading.stem}
-        what = next((what for what, known in _COLUMNS.items() if names & known), "alt" if heading.quantity else None)
+        named = next((what for what, known in _COLUMNS.items() if names & known), None)
+        what = named or ("alt" if heading.quantity else _accuracy(heading))
         if what is None or (what == "alt" and heading.datum in _NO_ALTITUDES):
             continue
         rank = _rank(heading) if what == "alt" else 0
         if rank < ranks.get(what, len(QUANTITIES)):
             found[what], ranks[what] = k, rank
     return found
+
+
+def _accuracy(heading: Heading) -> str | None:
+    """Which accuracy a heading's words say; None for other headings."""
+    stem = heading.stem
+    if _BARE_ACCURACY.fullmatch(stem):
+        return None
+    return next((what for what, words in _ACCURACIES.items() if words.fullmatch(stem)), None)
 
 
 def _rank(heading: Heading) -> int:
@@ -165,7 +198,7 @@ def west_or_east(words: Sequence[str]) -> str:
 def heading_notes(words: Sequence[str], known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> list[str]:
     """What to say of headings whose brackets are not understood, and of columns that are not read though they may be
     altitudes."""
-    notes = _unit_notes(words, known)
+    notes = _unit_notes(words, known) + _accuracy_notes(words, known)
     if "alt" in known:
         return notes
     ground = [word for word in words if _is_other_height(read_heading(word))]
@@ -199,6 +232,22 @@ def _unit_notes(words: Sequence[str], known: Mapping[str, int]) -> list[str]:
             unit = "degrees" if is_angle else "metres"
             notes.append(f"the unit of the column {words[known[what]]!r} is not understood; read as {unit}.")
     return notes
+
+
+def _accuracy_notes(words: Sequence[str], known: Mapping[str, int]) -> list[str]:
+    """What to say of accuracies that are not read: across without upwards, one side of two, of no axis."""
+    have_across = "across" in known or {"eastwards", "northwards"} <= {*known}
+    if have_across and "upwards" in known:
+        return []
+    spare = [words[known[what]] for what in ("across", "eastwards", "northwards", "upwards") if what in known]
+    spare += [word for word in words if _BARE_ACCURACY.fullmatch(read_heading(word).stem)]
+    if not spare:
+        return []
+    missing = " and ".join(
+        name for name, is_there in (("accuracy_horizontal", have_across), ("accuracy_vertical", "upwards" in known))
+        if not is_there
+    )  # fmt: skip
+    return [f"{', '.join(map(repr, spare))}: not read, for accuracies need columns across and upwards; add {missing}."]
 
 
 def _is_other_height(heading: Heading) -> bool:

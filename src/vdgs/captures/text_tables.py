@@ -28,8 +28,10 @@ _NAME_WITH_BLANKS = re.compile(
 )
 #: A point in WKT (OGC's simple features), with z and m or without.
 _WKT_POINT = re.compile(
-    r"\s*(?:SRID=\d+;)?POINT\s*Z?M?\s*\(\s*([-+.\deE]+)\s+([-+.\deE]+)(?:\s+[-+.\deE]+)*\s*\)\s*", re.IGNORECASE
+    r"\s*(?:SRID=\d+;)?POINT\s*(Z?M?)\s*\(\s*([-+.\deE]+)\s+([-+.\deE]+)(?:\s+([-+.\deE]+))?(?:\s+[-+.\deE]+)?\s*\)\s*",
+    re.IGNORECASE,
 )
+_POINT_BEGINS = re.compile(r"(?:SRID=\d+;)?POINT\s*Z?M?\s*\(", re.IGNORECASE)
 #: Lines that are looked at for the separator.
 LOOKED_AT = 20
 
@@ -138,9 +140,11 @@ def with_decimal_points(words: Sequence[str]) -> list[str]:
 
 
 def separator_of(lines: Sequence[str]) -> str | None:
-    """What parts the words of most lines into three or more; None for blanks."""
+    """What parts the words of most lines into three or more, a point in WKT for two; None for blanks."""
     for separator in _SEPARATORS:
-        if sum(line.count(separator) >= 2 for line in lines) * 2 > len(lines):
+        parted = (_POINT_BEGINS.subn("", line) for line in lines)
+        counts = (line.count(separator) + points for line, points in parted)
+        if sum(count >= 2 for count in counts) * 2 > len(lines):
             return None if separator == "," and _has_decimal_commas_only(lines) else separator
     return None
 
@@ -154,16 +158,23 @@ def _has_decimal_commas_only(lines: Sequence[str]) -> bool:
 
 
 def with_points_parted(rows: Sequence[Row]) -> list[Row]:
-    """Rows below one of headings whose column of points in WKT (`POINT (8.5 47.1)`, as QGIS writes geometries) is
-    parted into columns X and Y; others stay."""
+    """Rows below one of headings whose column of points in WKT (`POINT (8.5 47.1)`, `POINT Z (8.5 47.1 500)`, as QGIS
+    writes geometries) is parted into columns X and Y, and Z where points have one and no other column is an altitude;
+    others stay."""
     if len(rows) < 2:
         return list(rows)
-    for k in range(len(rows[0].words)):
+    head = rows[0].words
+    for k in range(len(head)):
         points = [_WKT_POINT.fullmatch(row.words[k]) if k < len(row.words) else None for row in rows[1:]]
-        if all(points):
-            parted = [["X", "Y"], *([point[1], point[2]] for point in points if point is not None)]
-            return [
-                Row(row.number, [*row.words[:k], *pair, *row.words[k + 1 :]])
-                for row, pair in zip(rows, parted, strict=True)
-            ]
+        if not all(points):
+            continue
+        found = [point.groups() for point in points if point is not None]
+        others = known_columns([*head[:k], *head[k + 1 :]])
+        has_z = "alt" not in others and any(z is not None and kind.upper() != "M" for kind, _, _, z in found)
+        parted = [["X", "Y", "Z"], *([x, y, (z or "") if kind.upper() != "M" else ""] for kind, x, y, z in found)]
+        count = 3 if has_z else 2
+        return [
+            Row(row.number, [*row.words[:k], *words[:count], *row.words[k + 1 :]])
+            for row, words in zip(rows, parted, strict=True)
+        ]
     return list(rows)

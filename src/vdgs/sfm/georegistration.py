@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vdgs.captures.gps_altitudes import wrong_reading
+from vdgs.captures.gps_altitudes import refuse_unit, wrong_reading, wrong_unit
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import DRIFT_COSTS, DRIFT_M, STATED_TIMES, PositionFit, Problem
 from vdgs.captures.position_fit import OTHER_COSINE, fit_positions, with_likelier_up
@@ -127,7 +127,9 @@ def georegister(
     if offsets is None and fit.altitude == "used" and len(positions.flights) == len(positions):
         offsets = untrusted_offsets(-fit.residuals[:, 2], fit.inliers | elsewhere, positions.flights[rows])
     fit = replace(fit, place_error_m=_place_error(fit, offsets, positions, rows))
-    fit, of_reading = _checked_reading(fit, problem, positions, offsets)
+    if positions.table is not None and positions.has_altitudes and not anyway:
+        refuse_unit(_unit(fit, problem, positions), "the cameras", positions.table)
+    fit, of_reading = _checked_reading(fit, problem, positions)
     on_a_line = is_nearly_collinear(targets[fit.inliers], positions.gps_std[rows][fit.inliers])
     fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
     fit, of_north = checked_by_headings(fit, images, taken, problem.times)
@@ -311,14 +313,19 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
     return steady, True, over_ground
 
 
-def _checked_reading(
-    fit: PositionFit, problem: Problem, positions: GpsPriors, offsets: AltitudeOffsets | None
-) -> tuple[PositionFit, list[str]]:
+def _unit(fit: PositionFit, problem: Problem, positions: GpsPriors) -> str:
+    """The unit of altitudes that are taken for another, as the photographs tell; empty where they do not."""
+    altitudes = problem.targets[:, 2] + positions.origin[2]
+    return wrong_unit(altitudes, fit.placed[:, 2], fit.placed[:, :2])
+
+
+def _checked_reading(fit: PositionFit, problem: Problem, positions: GpsPriors) -> tuple[PositionFit, list[str]]:
     """The fit with altitudes as uncertain as they are where they differ as those in feet or of the wrong sign do from
     heights by the photographs, and a note."""
-    if not positions.has_altitudes or (fit.altitude == "used" and offsets is None):
+    if not positions.has_altitudes:
         return fit, []
-    what, off = wrong_reading(problem.targets[:, 2] + positions.origin[2], fit.placed[:, 2])
+    altitudes = problem.targets[:, 2] + positions.origin[2]
+    what, off = wrong_reading(altitudes, fit.placed[:, 2], fit.placed[:, :2])
     if not what:
         return fit, []
     across, up = fit.place_error_m

@@ -71,6 +71,8 @@ class GpsPriors:
     """How far each may be off [m] by the datum that it was of; empty where all are of WGS 84."""
     altitude_step_m: float = 0.0
     """What altitudes are rounded to; 0 where that is not seen."""
+    table: Path | None = None
+    """The table that their altitudes are of; None for those of the photographs themselves."""
 
     def __len__(self) -> int:
         return len(self.image_indices)
@@ -149,6 +151,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         has_altitudes=has_altitudes,
         flights=flights_of(taken, of_each, heights),
         altitude_step_m=step,
+        table=table if any(np.isfinite(row.position[2]) for row in recorded.rows.values()) else None,
         datum_errors_m=np.array([photo.datum_error_m if table is None else recorded.datum_error_m for photo in taken]),
     )
 
@@ -335,7 +338,8 @@ def _other_altitudes(rows: Mapping[int, GpsRow], photographs: Sequence[ImageMeta
     given, own = pairs.reshape(-1, 2)[np.isfinite(pairs.reshape(-1, 2)).all(axis=1)].T
     if len(own) < MIN_POSITIONS or not given.any() or not own.any():
         return []
-    refuse_unit(wrong_unit(given, own), "those of the photographs", table)
+    if wrong_unit(given, own) == "feet":  # EXIF may be in feet itself: of metres the cameras tell
+        refuse_unit("feet", "those of the photographs", table)
     off = float(np.median(given - own))
     if abs(off) < TOLD_ALTITUDE_M:
         return []

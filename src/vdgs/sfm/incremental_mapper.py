@@ -43,6 +43,7 @@ OF_LINE = "along one line, which cannot tell it while views are parallel; the mo
 OF_SHAPE = "several heights or views, as the photographs themselves show, which tell it"
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
 ASKED = "asked for"
+TAGS_DISAGREE = "what the photographs say of it contradicts itself"
 CONTRADICTED = "held at what one tag alone says of it, the photographs fit together plainly worse"
 CONFIRMED = "tags that agree say it, and the photographs cannot tell it: fitted, it went astray"
 #: A fitted focal length contradicts the held one where points lie nearer to where they are seen by this share (choice),
@@ -95,7 +96,7 @@ def _by_lenses(photographs: Sequence[ImageMetadata]) -> tuple[bool, str] | None:
     if sum(photo.lens is None for photo in photographs) > few:
         return False, "nothing says it for some photographs"
     if sum(bool(photo.lens and photo.lens.doubt) for photo in photographs) > few:
-        return False, "what the photographs say of it contradicts itself"
+        return False, TAGS_DISAGREE
     return None
 
 

@@ -32,6 +32,9 @@ _ROUNDED_DEG = 1e-5
 #: Photographs show the same where the order of the gray values of their pixels correlates so well, by so many of them
 #: (choice; five aerial photographs and themselves moved by 2 % of the width: 0.54 to 0.92).
 SAME_PICTURE, LOOKED_AT_PAIRS = 0.95, 3
+#: And are one that was saved again from so much on (choice; photographs of 400 pixels as JPEG of quality 30:
+#: from 0.992; moved by one pixel: up to 0.974).
+SAVED_AGAIN = 0.99
 #: A picture that was cut from another is looked for in so small a one, in so many sizes, and found where gray values
 #: correlate so well (choice: every size is within a few per cent of one that is tried).
 _SEARCHED_PX, _SEARCHED_SIZES, _SAME_PART = 320, 24, 0.8
@@ -46,6 +49,7 @@ Folder = Mapping[str, ImageMetadata]
 def versions(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """Photographs of which another version is among the others, with the reason."""
     reasons = _cut_copies(photographs) | _smaller_copies(photographs) | _later_copies(photographs)
+    reasons |= _saved_again([photo for photo in photographs if photo.name not in reasons])
     return reasons | _versions_elsewhere([photo for photo in photographs if photo.name not in reasons])
 
 
@@ -207,6 +211,45 @@ def _why_version(photo: ImageMetadata, first: ImageMetadata, edited: bool) -> st
     return "its name and what it shows" if seen else ""
 
 
+def _saved_again(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
+    """Photographs that were saved again beside the first one under a name of another kind (`edit_7.jpg` for
+    `DJI_0007.JPG`): of one folder, camera, moment and place, and they show the same. Photographs of a burst
+    or a bracket are named alike, and bands and lenses of one moment show something else."""
+    moments: dict[tuple[str, ...], list[ImageMetadata]] = {}
+    for photo in photographs:
+        if photo.datetime and not photo.is_bare and photo.kind != "raw":
+            folder = str(PurePosixPath(photo.name).parent)
+            moments.setdefault((folder, photo.camera, photo.datetime), []).append(photo)
+    usual = Counter(_kind_of_name(photo) for photo in photographs)
+    found = dict[str, str]()
+    for alike in moments.values():
+        ordered = sorted(alike, key=lambda photo: (-usual[_kind_of_name(photo)], -photo.width, photo.name))
+        for k, photo in enumerate(ordered):
+            first = next((one for one in ordered[:k] if one.name not in found and _is_saved_again(photo, one)), None)
+            if first is not None:
+                found[photo.name] = f"is a copy of {first.name}, by its camera, moment, place and what it shows"
+    return found
+
+
+def _kind_of_name(photo: ImageMetadata) -> str:
+    """The folder and what a name says without its numbers."""
+    return re.sub(r"\d+", "#", PurePosixPath(photo.name).with_suffix("").as_posix().lower())
+
+
+def _is_saved_again(photo: ImageMetadata, first: ImageMetadata) -> bool:
+    if _kind_of_name(photo) == _kind_of_name(first) or (photo.lat_lon is None) != (first.lat_lon is None):
+        return False
+    if _are_of_two_lenses(*(PurePosixPath(each.name).stem for each in (photo, first))):
+        return False
+    return _is_one_exposure(first, photo) and _alike(first, photo) >= SAVED_AGAIN
+
+
+def _are_of_two_lenses(one: str, other: str) -> bool:
+    """Whether stems have a number in common and an ending each, as of lenses and bands: DJI_0001_W and DJI_0001_Z."""
+    count = next((k for k, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
+    return any(map(str.isdigit, one[:count])) and count < min(len(one), len(other))
+
+
 def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     """Photographs that another folder has too, edited or as raw files: of one name, or of a camera and a moment that no
     other of their folder has; of one moment, place and shape, and they show the same. The folder of more photographs is
@@ -275,11 +318,15 @@ def _show_the_same(pairs: Sequence[tuple[ImageMetadata, ImageMetadata]]) -> bool
     and a picture of one exposure do."""
     chosen = [pairs[k] for k in sorted({len(pairs) * part // LOOKED_AT_PAIRS for part in range(LOOKED_AT_PAIRS)})]
     for one, other in chosen:
-        if (one.kind == "raw") == (other.kind == "raw"):
-            ranks = _gray_ranks(one), _gray_ranks(other)
-            if not all(np.any(each) for each in ranks) or np.corrcoef(ranks)[0, 1] < SAME_PICTURE:
-                return False
+        if (one.kind == "raw") == (other.kind == "raw") and _alike(one, other) < SAME_PICTURE:
+            return False
     return True
+
+
+def _alike(one: ImageMetadata, other: ImageMetadata) -> float:
+    """How well the order of the gray values of two photographs correlates; -1 where one shows nothing."""
+    ranks = _gray_ranks(one), _gray_ranks(other)
+    return float(np.corrcoef(ranks)[0, 1]) if all(np.any(each) for each in ranks) else -1.0
 
 
 def _gray_ranks(photo: ImageMetadata) -> np.ndarray:

@@ -24,7 +24,7 @@ from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import RADIAL, ImageMetadata
-from vdgs.sfm.incremental_mapper import CONTRADICTED, refined_cameras
+from vdgs.sfm.incremental_mapper import CONTRADICTED, TAGS_DISAGREE, refined_cameras
 from vdgs.sfm.preflight import (
     LEVEL_TILT_DEG,
     MIN_OVERLAP,
@@ -216,6 +216,19 @@ def _photographs(
     return tuple(ImageReport(name, residuals.get(name), why.get(name), files.get(name)) for name in names)
 
 
+def _of_focal_drift(drift: float, why_fitted: str, height: float | None, recorded: float | None) -> str:
+    """What to do about a fitted focal length that is off its tag by a share: nothing where the height that was flown
+    is the recorded one by it, and would not be by the tag."""
+    if height is not None and recorded and abs(height / recorded - 1) < abs(drift) / 2:
+        return "; the flying height is the recorded one by the fitted one, which is used: the tag seems to be wrong"
+    if why_fitted == TAGS_DISAGREE:
+        return (
+            ", and its tags contradict each other: the fitted one is used. Mend the tags if heights look wrong, and "
+            "then hold it (--focal fixed)"
+        )
+    return "; if heights look wrong, hold it: --focal fixed"
+
+
 def _warnings(
     cameras: Sequence[CameraReport],
     held: tuple[bool, str],
@@ -234,7 +247,7 @@ def _warnings(
             )
         drift = camera.focal_after_px / camera.focal_before_px - 1
         if not held[0] and camera.focal_source != "a guess" and abs(drift) > MAX_FOCAL_DRIFT:
-            remedy = "; if heights look wrong, hold it: --focal fixed"
+            remedy = _of_focal_drift(drift, held[1], height, recorded)
             if not camera.is_fisheye and _is_short(camera):
                 remedy = (
                     ". Lenses so short may be fisheyes: say it (--camera-model opencv-fisheye). Or did a program "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from urllib.parse import unquote
 
 from vdgs.captures.capture import Split
 from vdgs.captures.image_files import readable_images, readable_suffixes
@@ -37,6 +38,10 @@ class FramePhotographs:
         pose of one of them would be of another photograph.
         """
         parts = _parts(frame, file)
+        decoded = tuple(map(unquote, parts))  # as in a URI: a%20b.png
+        return self._find(parts, file, split) or self._find(decoded, file, split) or "/".join(parts)
+
+    def _find(self, parts: tuple[str, ...], file: Path, split: Split) -> tuple[str, Path] | None:
         tails = [parts, (split, *parts[-2:]), *(parts[k:] for k in range(1, len(parts)))]
         for tail in tails:
             for base in self._bases(file):
@@ -44,7 +49,7 @@ class FramePhotographs:
                 if image is not None:
                     self._check_meant_once(image, parts, file)
                     return self._name(image, split), image
-        return "/".join(parts)
+        return None
 
     def _bases(self, file: Path) -> list[Path]:
         if self._images is not None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -49,10 +50,11 @@ _UNSCALE = (
 
 
 def mask_of_frame(frame: JsonObject, file: Path, root: Path) -> Path | None:
-    """The mask that a frame names. Raises `CaptureError` for a path that leaves the capture."""
+    """The mask that a frame names, also as in a URI (`%20`). Raises `CaptureError` for a path that leaves the
+    capture."""
     mask = frame.get("mask_path")
     name = safe_name(str(mask), file, "mask_path", root) if mask else None
-    return (find_file(root, name) or root / name) if name else None
+    return (find_file(root, name) or find_file(root, unquote(name)) or root / name) if name else None
 
 
 def read_capture_json(file: Path) -> JsonObject:

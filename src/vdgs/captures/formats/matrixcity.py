@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from vdgs.captures.capture import Split
+from vdgs.captures.formats.cloud_worlds import CloudFrame, Eye, in_world_of
 from vdgs.captures.formats.frame_photographs import IMAGE_FOLDERS, FramePhotographs
 from vdgs.captures.formats.json_poses import (
     camera_motion,
@@ -33,6 +34,7 @@ from vdgs.captures.formats.source_capture import (
     WorldPrior,
     leave_out_bad_poses,
     one_view_each,
+    points_command,
     refuse_lost_tests,
     refuse_many_missing,
     without_tested,
@@ -106,7 +108,10 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
     what = "MatrixCity's layout" if read.is_city else files[0][0].name
-    points, colors = find_sparse_points(root, poses, what, images=options.images, needs_points=needs_points)
+    points, colors = find_sparse_points(
+        root, poses, what, images=options.images, needs_points=needs_points,
+        placed=lambda points, cloud: _placed(points, cloud, read.is_city, views, warnings, root, options),
+    )  # fmt: skip
     if not read.is_city and needs_points and any(_is_transparent(view.image_path) for view in views[:1]):
         warnings.append(
             "what is transparent is left out of training and figures, as by a mask. Figures of sets of Blender are "
@@ -124,6 +129,19 @@ def read_matrixcity(root: Path, options: CaptureOptions, needs_points: bool = Tr
         world=_world(read),
         warnings=tuple(warnings),
     )
+
+
+def _placed(
+    points: np.ndarray, cloud: Path, is_city: bool, views: Sequence[SourceView], notes: list[str], root: Path,
+    options: CaptureOptions,
+) -> np.ndarray:  # fmt: skip
+    """The points of a cloud in the world of the poses, which are in metres or in units of 100 m in a city."""
+    eyes = [Eye(view.camera_from_world, view.intrinsics) for view in views]
+    others: list[CloudFrame] = [("in metres", lambda p: p / 100), ("in units of 100 m", lambda p: p * 100)]
+    remedy = (
+        f"Write it in the world of the poses, or move it away and find points: {points_command(root, options.images)}"
+    )
+    return in_world_of(points, cloud, eyes, others if is_city else [], notes, remedy)
 
 
 def _read_frames(files: Sequence[tuple[Path, Split]], root: Path, options: CaptureOptions) -> _Frames:

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from vdgs.captures.capture import Split
+from vdgs.captures.formats.cloud_worlds import CloudFrame, Eye, in_world_of
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV
 from vdgs.captures.formats.source_capture import (
     Intrinsics,
@@ -21,6 +22,7 @@ from vdgs.captures.formats.source_capture import (
     SourceView,
     WorldPrior,
     check_intrinsics,
+    points_command,
     refuse_lost_tests,
     refuse_many_missing,
     to_rigid,
@@ -47,8 +49,8 @@ def is_mega_nerf(root: Path) -> bool:
 def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = True) -> SourceCapture:
     """The capture in Mega-NeRF's layout; its world is that of coordinates.pt, in metres, axes DRB.
 
-    Points come from points3D.ply (in the same world) or a COLMAP model in sparse/. `options.images` names
-    another image folder than rgbs. Raises `CaptureError` for missing or damaged files.
+    Points come from points3D.ply (in the same world, or in that of its poses) or a COLMAP model in sparse/.
+    `options.images` names another image folder than rgbs. Raises `CaptureError` for missing or damaged files.
     """
     file = root / "coordinates.pt"
     coordinates = _load(file)
@@ -74,9 +76,11 @@ def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = Tru
     views, both = without_tested(views, _also_tested(views, tests))
     warnings += both
     poses = {view.name: view.camera_from_world for view in views}
+    eyes, remedy = [Eye(view.camera_from_world, view.intrinsics) for view in views], _remedy(root, options)
     points, colors = find_sparse_points(
-        root, poses, "Mega-NeRF's layout", _aliases(root, views), images=options.images, needs_points=needs_points
-    )
+        root, poses, "Mega-NeRF's layout", _aliases(root, views), images=options.images, needs_points=needs_points,
+        placed=lambda points, cloud: in_world_of(points, cloud, eyes, _cloud_frames(origin, scale), warnings, remedy),
+    )  # fmt: skip
     world = WorldPrior(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in SPLIT_FOLDERS)
     return SourceCapture(
@@ -88,6 +92,22 @@ def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = Tru
         world=world,
         image_folders=folders,
         warnings=tuple(warnings),
+    )
+
+
+def _cloud_frames(origin: np.ndarray, scale: float) -> list[CloudFrame]:
+    """Coordinates other than metres DRB that a PLY may have."""
+    return [
+        ("in the world of its poses (origin_drb and pose_scale_factor not undone)", lambda p: p * scale + origin),
+        ("in metres from origin_drb", lambda p: p + origin),
+        ("divided by pose_scale_factor", lambda p: p * scale),
+    ]
+
+
+def _remedy(root: Path, options: CaptureOptions) -> str:
+    return (
+        "Write it in metres, x down, y right, z back (c2w of the poses, times pose_scale_factor, plus origin_drb), or "
+        f"move it away and find points anew: {points_command(root, options.images)}"
     )
 
 

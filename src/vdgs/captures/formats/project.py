@@ -16,6 +16,7 @@ import numpy as np
 
 from vdgs.captures.capture import Observations
 from vdgs.captures.coordinate_systems import ToGeodetic
+from vdgs.captures.formats.cloud_worlds import LEAST_SEEN, POINTS_LOOKED_AT, CloudFrame, Eye, share_seen
 from vdgs.captures.formats.colmap_records import sample_observations
 from vdgs.captures.formats.las_reader import can_read_las, find_las, read_las_points
 from vdgs.captures.formats.lens_projection import pixel_rays
@@ -27,18 +28,12 @@ from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.georeference import Georef
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.geometry.camera import camera_center, camera_centers
+from vdgs.geometry.camera import camera_centers
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
 from vdgs.geometry.similarity import sample_points
 
-#: A cloud belongs to the cameras if this share of its points fall into photographs (choice).
-LEAST_SEEN, POINTS_LOOKED_AT = 0.3, 2000
-#: Points farther from a camera than this many times the spread of the cameras are not of their place.
-MAX_DISTANCE_RATIO = 100.0
 #: Where ODM and PIX4Dmapper put their dense clouds.
 _DENSE = ("odm_georeferencing", "*/2_densification/point_cloud", "2_densification/point_cloud")
-#: The name of some coordinates, and what brings points [n, 3] from there.
-CloudFrame = tuple[str, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -218,13 +213,17 @@ def _cloud_beside(
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Points and colors of a PLY, LAS or LAZ beside a project that its cameras see, in the world, and a note on it."""
     find_points = points_command(project.file if project.file.parent == root else root, images)
+    dense = [folder for each in _DENSE for folder in sorted(root.glob(each))]
     cloud = find_point_cloud(root, project.file.parent, lone=True)
-    las = find_las((root, project.file.parent, *(folder for each in _DENSE for folder in sorted(root.glob(each)))))
+    las = find_las((root, project.file.parent, *dense))
     if cloud is None and can_read_las():
         cloud = las
+    cloud = cloud or find_point_cloud(*dense, lone=True)
     if cloud is None:
         more = f" {las} is not read: it needs pip install 'vdgs[geo]'." if las is not None else ""
-        if several := sorted(each.name for each in {*root.glob("*.ply"), *project.file.parent.glob("*.ply")}):
+        if several := sorted(
+            {each.name for folder in (root, project.file.parent, *dense) for each in folder.glob("*.ply")}
+        ):
             more += f" Several are there ({', '.join(several[:3])}): call the one that is meant {POINT_CLOUDS[0]}."
         raise NoTiePoints(
             f"{project.file}: brings poses but no 3D points, from which the scene starts. This finds them, with the "
@@ -235,10 +234,11 @@ def _cloud_beside(
     frames: list[CloudFrame] = [("of the project", world.moved)]
     frames += [(name, _after(change, world)) for name, change in project.cloud_frames]
     frames.append(("of the scene", lambda points: points))
+    eyes = [Eye(pose, view.intrinsics) for pose, view in zip(poses, project.views, strict=True)]
     best, seen, what = points, -1.0, ""
     for name, change in frames:
         with np.errstate(all="ignore"):
-            share = _seen(change(sample_points(points, POINTS_LOOKED_AT)), poses, project.views)
+            share = share_seen(change(sample_points(points, POINTS_LOOKED_AT)), eyes)
         if share > seen:
             best, seen, what = change(points), share, name
     if seen < LEAST_SEEN:
@@ -252,19 +252,3 @@ def _cloud_beside(
 
 def _after(change: Callable[[np.ndarray], np.ndarray], world: _World) -> Callable[[np.ndarray], np.ndarray]:
     return lambda points: world.to_enu(change(points))
-
-
-def _seen(points: np.ndarray, poses: Sequence[np.ndarray], views: Sequence[ProjectView]) -> float:
-    """The share of points that lie before some camera, where its photograph is, lens distortion aside."""
-    points = points[np.isfinite(points).all(axis=1)]
-    centers = np.stack([camera_center(pose) for pose in poses])
-    farthest = MAX_DISTANCE_RATIO * float(
-        np.quantile(np.linalg.norm(centers - np.median(centers, axis=0), axis=1), 0.9)
-    )
-    seen = np.zeros(len(points), bool)
-    for pose, view in zip(poses, views, strict=True):
-        x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
-        (fx, fy), (cx, cy), lens = view.intrinsics.focal, view.intrinsics.principal_point, view.intrinsics
-        u, v = fx * x + cx * z, fy * y + cy * z
-        seen |= (z > 0) & (z <= farthest) & (u >= 0) & (v >= 0) & (u <= lens.width * z) & (v <= lens.height * z)
-    return float(seen.mean()) if len(seen) else 0.0

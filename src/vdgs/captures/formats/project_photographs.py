@@ -45,7 +45,7 @@ def find_photographs(
     several cameras'.
     """
     folder = image_root(root, options)
-    images = _find_images(folder, options)
+    images = images_below(folder, options)
     index = PhotographIndex(images)
     meant = [index.find_all(each) for each in names]
     found = [each[0] if len(each) == 1 else None for each in meant]
@@ -148,7 +148,7 @@ def image_root(root: Path, options: CaptureOptions) -> Path:
     raise CaptureError(f"--images {options.images}: no such folder, neither in {root} nor from here.")
 
 
-def _find_images(root: Path, options: CaptureOptions) -> dict[str, Path]:
+def images_below(root: Path, options: CaptureOptions) -> dict[str, Path]:
     """Photographs in and below a folder, without masks, results and undistorted copies."""
     apart = options.undistorted_folder.resolve() if options.undistorted_folder else None
     found = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ def find_sparse_points(
     *,
     images: str | None = None,
     needs_points: bool = True,
+    placed: Callable[[np.ndarray, Path], np.ndarray] = lambda points, _: points,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colors [n, 3]
     uint8.
@@ -40,16 +41,17 @@ def find_sparse_points(
     Taken from a PLY file in that world, else from a COLMAP model of the same photographs, which may live
     in any world: it is brought over by the similarity between the camera centers that both have. `aliases`
     maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
-    that its cameras do not replace `poses`; `images` is the folder that `--images` names. Raises `NoTiePoints` if
-    there is nothing, unless nothing `needs_points`, and `CaptureError` if there is nothing that fits.
+    that its cameras do not replace `poses`; `images` is the folder that `--images` names; `placed` brings the points
+    of a PLY into that world where they are in another. Raises `NoTiePoints` if there is nothing, unless nothing
+    `needs_points`, and `CaptureError` if there is nothing that fits.
     """
     cloud = find_point_cloud(root)
     if cloud is not None:
-        return read_point_cloud(cloud)
+        return _read_placed(cloud, placed)
     models = find_models(root)
     cloud = None if models else find_point_cloud(root, lone=True)
     if cloud is not None:
-        return read_point_cloud(cloud)
+        return _read_placed(cloud, placed)
     if not models and not needs_points:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not models:
@@ -82,6 +84,11 @@ def find_sparse_points(
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
         )
     return similarity.apply(model.points), model.colors
+
+
+def _read_placed(cloud: Path, placed: Callable[[np.ndarray, Path], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    points, colors = read_point_cloud(cloud)
+    return placed(points, cloud), colors
 
 
 def find_point_cloud(*folders: Path, lone: bool = False) -> Path | None:

@@ -7,12 +7,15 @@ world is the original one, so that georeferences hold.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 
 from vdgs.captures.capture import Split
+from vdgs.captures.formats.cloud_worlds import CloudFrame, Eye, in_world_of
 from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
@@ -25,6 +28,7 @@ from vdgs.captures.formats.json_poses import (
 from vdgs.captures.formats.lens_keys import unread_keys
 from vdgs.captures.formats.listed_names import find_listed
 from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.project_photographs import PhotographIndex, images_below
 from vdgs.captures.formats.source_capture import (
     BadPose,
     SourceCapture,
@@ -32,6 +36,7 @@ from vdgs.captures.formats.source_capture import (
     find_image,
     leave_out_bad_poses,
     one_view_each,
+    points_command,
     refuse_lost_tests,
     refuse_many_missing,
     safe_name,
@@ -86,7 +91,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     frames = get_frames(content, file)
     held_out = get_frames(content, file, TEST_FRAMES) if content.get(TEST_FRAMES) else []
     count, frames = len(frames), [*frames, *held_out]
-    photographs = _find_photographs([_file_path(frame, file) for frame in frames], file, root, options)
+    photographs = _find_decoded([_file_path(frame, file) for frame in frames], file, root, options)
     names, chosen, notes = photographs.names, photographs.folder, photographs.notes
     splits = _splits(content, names, count, file, options, notes)
     notes += [f"{file.name}: {note}" for note in unread_keys(content, frames)]
@@ -123,7 +128,12 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
     views = one_view_each(views, file, bad)
     warnings += leave_out_bad_poses(bad, len(frames) - len(missing), file, options.strict)
     poses = {view.name: poses[view.name] for view in views}
-    points, colors = _points(root, content, file, poses, options.images, needs_points, warnings)
+    eyes = [Eye(poses[view.name], view.intrinsics) for view in views]
+
+    def placed(points: np.ndarray, cloud: Path) -> np.ndarray:
+        return in_world_of(points, cloud, eyes, applied.cloud_frames(), warnings, _remedy(root, options))
+
+    points, colors = _points(root, content, file, poses, options.images, needs_points, warnings, placed)
     return SourceCapture(
         source="transforms",
         images=chosen,
@@ -132,6 +142,13 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
         colors=colors,
         image_folders=(root / chosen,) if chosen else (),
         warnings=tuple(warnings),
+    )
+
+
+def _remedy(root: Path, options: CaptureOptions) -> str:
+    return (
+        "Write it in the world of the poses (or name no ply_file_path and move it away), or find points anew: "
+        f"{points_command(root, options.images)}"
     )
 
 
@@ -156,9 +173,26 @@ class _Photographs(NamedTuple):
     notes: list[str]
 
 
+def _find_decoded(written: list[str], file: Path, root: Path, options: CaptureOptions) -> _Photographs:
+    """As `_find_photographs`, which also raises; paths that are not there as they are may be those of a URI (`%20`)."""
+    plain = [unquote(path) for path in written]
+    try:
+        found = _find_photographs(written, file, root, options)
+    except CaptureError:
+        if plain == written:
+            raise
+        return _find_photographs(plain, file, root, options)
+    gone = [image is None for image in found.images]
+    if plain == written or not any(gone):
+        return found
+    mixed = [other if is_gone else path for path, other, is_gone in zip(written, plain, gone, strict=True)]
+    decoded = _find_photographs(mixed, file, root, options)
+    return decoded if decoded.images.count(None) < gone.count(True) else found
+
+
 def _find_photographs(written: list[str], file: Path, root: Path, options: CaptureOptions) -> _Photographs:
-    """By the paths that frames have in the file; where none of these is in the folder that `--images` names, by their
-    ends: they may be of another folder or machine. Raises `CaptureError` for paths that leave the capture."""
+    """By the paths that frames have in the file; where none of these is there, or in the folder that `--images` names,
+    by their ends: they may be of another folder or machine. Raises `CaptureError` for paths that leave the capture."""
     outside = None
     try:
         names = [safe_name(path, file, "file_path", root) for path in written]
@@ -168,17 +202,46 @@ def _find_photographs(written: list[str], file: Path, root: Path, options: Captu
     chosen, notes = _image_folder(root, folder, options)
     shorts = [name.removeprefix(folder + "/") if folder else name for name in names]
     images = [find_image(root, f"{chosen}/{short}" if chosen else short) for short in shorts]
-    if options.images is not None and not any(images):
-        there = find_images(root / chosen)
-        once = list(dict.fromkeys(written))
-        found = dict(zip(once, find_in_other_folders(once, there, root / chosen, notes), strict=True))
-        if any(found.values()):
-            names = [found[path] or path for path in written]
-            return _Photographs(names, names, [there.get(name) for name in names], chosen, notes)
+    if not any(images):
+        elsewhere = _find_elsewhere(written, file, root, options)
+        if elsewhere is not None:
+            return elsewhere._replace(notes=[*notes, *elsewhere.notes])
     if outside is not None:
         remedy = "Or say which folder they are in: --images FOLDER" if options.images is None else "Mend the paths."
         raise CaptureError(f"{outside} {remedy}") from outside
     return _Photographs(names, shorts, images, chosen, notes)
+
+
+def _find_elsewhere(written: list[str], file: Path, root: Path, options: CaptureOptions) -> _Photographs | None:
+    """By the ends of paths, in the folder that `--images` names, else by file names in the whole capture, which a note
+    says; None where no path means one photograph alone there. Raises `CaptureError` where each may mean several."""
+    once = list(dict.fromkeys(written))
+    if options.images is not None:
+        folder, notes = root / options.images, list[str]()
+        there = find_images(folder)
+        found = dict(zip(once, find_in_other_folders(once, there, folder, notes), strict=True))
+        names = [found[path] or path for path in written]
+        images = [there.get(name) for name in names]
+        return _Photographs(names, names, images, options.images, notes) if any(images) else None
+    there = images_below(root, options)
+    index = PhotographIndex(there)
+    meant = {path: index.find_all((path,)) for path in once}
+    single = {path: each[0] for path, each in meant.items() if len(each) == 1}
+    several = {path: each for path, each in meant.items() if len(each) > 1}
+    if len(several) == len(once):
+        first, either = next(iter(several.items()))
+        raise CaptureError(
+            f"{file}: its photographs are not where it says, and there several times elsewhere: {first!r} may be "
+            f"{either[0]} or {either[1]}. Give the folder of the right ones with --images."
+        )
+    if not single or len(set(single.values())) < len(single):
+        return None
+    first, name = next(iter(single.items()))
+    note = f"the photographs are not where {file.name} says, but in other folders: {first} is taken as {name}."
+    names = [single.get(path, path) for path in written]
+    top = _common_folder(list(single.values()))
+    shorts = [name.removeprefix(f"{top}/") for name in names]
+    return _Photographs(names, shorts, [there.get(name) for name in names], top, [note])
 
 
 def _common_folder(names: list[str]) -> str:
@@ -215,7 +278,8 @@ def _splits(
         if not isinstance(written, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
         if written and options.split != "every":
-            found, unknown = find_listed(list(map(str, written)), names, f"{file}: {key}", strict=options.strict)
+            wanted = [name if name in names else unquote(name) for name in map(str, written)]
+            found, unknown = find_listed(wanted, names, f"{file}: {key}", strict=options.strict)
             listed[side] = listed[side] | found
             sides.add(side)
             notes += unknown
@@ -239,6 +303,20 @@ class _Applied(NamedTuple):
         unscaled = world_from_camera.copy()
         unscaled[:3, 3] /= self.scale
         return self.original_from_world @ unscaled
+
+    def cloud_frames(self) -> list[CloudFrame]:
+        """Coordinates other than those of the file that a point cloud may have, and what brings them there."""
+        turn, shift = self.original_from_world[:3, :3], self.original_from_world[:3, 3]
+        if self.scale == 1 and np.allclose(self.original_from_world, np.eye(4)):
+            return []
+        return [
+            (
+                "in the world before applied_transform (and applied_scale)",
+                lambda points: (points - shift) @ turn * self.scale,
+            ),
+            ("in the world before applied_scale", lambda points: points * self.scale),
+            ("in the world before applied_transform, but scaled", lambda points: (points - self.scale * shift) @ turn),
+        ]
 
     def undo_places(self, places: np.ndarray) -> np.ndarray:
         """Places [n, 3] in the original world."""
@@ -266,6 +344,7 @@ def _points(
     images: str | None,
     needs_points: bool,
     notes: list[str],
+    placed: Callable[[np.ndarray, Path], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
@@ -274,10 +353,13 @@ def _points(
     except CaptureError as error:
         raise CaptureError(f"{error} Or put the point cloud beside it, by the same name.") from error
     if cloud is not None and cloud.is_file():
-        return read_point_cloud(cloud)
+        points, colors = read_point_cloud(cloud)
+        return placed(points, cloud), colors
     what = TRANSFORMS_FILE if cloud is None else f"{TRANSFORMS_FILE}, whose ply_file_path {ply} is not there,"
     option = " and give --format transforms"
-    found = find_sparse_points(root, poses, what, option=option, images=images, needs_points=needs_points)
+    found = find_sparse_points(
+        root, poses, what, option=option, images=images, needs_points=needs_points, placed=placed
+    )
     if cloud is not None and len(found[0]):
         notes.append(
             f"{cloud}: is not there, though {TRANSFORMS_FILE} names it; {len(found[0]):,} points beside it are used."

@@ -1,0 +1,104 @@
+"""In which coordinates a point cloud beside cameras is: those in which its points fall into their photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from vdgs.captures.formats.source_capture import Intrinsics
+from vdgs.errors import CaptureError
+from vdgs.geometry.camera import camera_center
+from vdgs.geometry.similarity import sample_points
+
+#: A cloud belongs to the cameras if this share of its points fall into photographs (choice).
+LEAST_SEEN, POINTS_LOOKED_AT = 0.3, 2000
+#: Points farther from a camera than this many times the spread of the cameras are not of their place.
+MAX_DISTANCE_RATIO = 100.0
+#: Photographs are looked at in so many parts a side, and so many of them, with more points: a few may cover them.
+PARTS, VIEWS_LOOKED_AT, POINTS_IN_PARTS = 4, 40, 50_000
+#: A cloud is in other coordinates than it should be where it covers so many times more of the photographs there
+#: (choice), and of another place where it covers less of them than this, and `LEAST_SEEN` is not met.
+BETTER, LEAST_COVERED = 2.0, 0.1
+
+#: The name of some coordinates, and what brings points [n, 3] from there.
+CloudFrame = tuple[str, Callable[[np.ndarray], np.ndarray]]
+
+
+class Eye(NamedTuple):
+    """A camera: its pose [4, 4] (camera from world), and its lens, of which distortion is left aside."""
+
+    camera_from_world: np.ndarray
+    lens: Intrinsics
+
+
+def share_seen(points: np.ndarray, eyes: Sequence[Eye]) -> float:
+    """The share of points [n, 3] that lie before some camera, where its photograph is."""
+    points = points[np.isfinite(points).all(axis=1)]
+    farthest = _farthest(eyes)
+    seen = np.zeros(len(points), bool)
+    for eye in eyes:
+        seen |= _shares_of_sides(points, eye, farthest)[0]
+    return float(seen.mean()) if len(seen) else 0.0
+
+
+def share_covered(points: np.ndarray, eyes: Sequence[Eye]) -> float:
+    """The share of the parts of some photographs that show a point."""
+    points = points[np.isfinite(points).all(axis=1)]
+    farthest, covered = _farthest(eyes), list[float]()
+    for eye in eyes[:: max(1, len(eyes) // VIEWS_LOOKED_AT)]:
+        seen, across, down = _shares_of_sides(points, eye, farthest)
+        parts = np.floor(PARTS * np.column_stack([across[seen], down[seen]])).clip(0, PARTS - 1)
+        covered.append(len(np.unique(parts @ [1, PARTS])) / PARTS**2)
+    return float(np.mean(covered)) if covered else 0.0
+
+
+def in_world_of(
+    points: np.ndarray, cloud: Path, eyes: Sequence[Eye], others: Sequence[CloudFrame], notes: list[str], remedy: str
+) -> np.ndarray:
+    """Points [n, 3] of a cloud in the world of cameras: as they are, unless they cover far more of the photographs once
+    brought there from one of `others`, which a note says.
+
+    Raises `CaptureError`, with the `remedy`, for a cloud that hardly any photograph shows.
+    """
+    if not len(points) or not eyes:
+        return points
+    looked_at = sample_points(points, POINTS_IN_PARTS)
+    with np.errstate(all="ignore"):
+        usual = share_covered(looked_at, eyes)
+        found = [(share_covered(change(looked_at), eyes), name, change) for name, change in others]
+        best, name, change = max(found, key=lambda each: each[0], default=(0.0, "", lambda points: points))
+        if best > BETTER * usual and best >= LEAST_COVERED:
+            notes.append(
+                f"{cloud.name}: its points are {name}, where the photographs show them; they are brought over."
+            )
+            return change(points)
+        if usual >= LEAST_COVERED:
+            return points
+        seen = share_seen(sample_points(points, POINTS_LOOKED_AT), eyes)
+    if seen < LEAST_SEEN:
+        raise CaptureError(
+            f"{cloud}: its points are not where the cameras look ({seen:.0%} fall into photographs): it is in other "
+            "coordinates, or of another place, or the poses are of another convention (OpenCV's axes in place of "
+            f"OpenGL's axes, camera-from-world in place of world-from-camera). {remedy}"
+        )
+    return points
+
+
+def _farthest(eyes: Sequence[Eye]) -> float:
+    centers = np.stack([camera_center(eye.camera_from_world) for eye in eyes])
+    spread = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return MAX_DISTANCE_RATIO * float(np.quantile(spread, 0.9))
+
+
+def _shares_of_sides(points: np.ndarray, eye: Eye, farthest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which points [n] a photograph shows, bool, and where: shares of its width and of its height."""
+    pose, lens = eye
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
+    (fx, fy), (cx, cy) = lens.focal, lens.principal_point
+    with np.errstate(all="ignore"):
+        across, down = (fx * x / z + cx) / lens.width, (fy * y / z + cy) / lens.height
+    seen = (z > 0) & (z <= farthest) & (across >= 0) & (down >= 0) & (across <= 1) & (down <= 1)
+    return seen, across, down
