@@ -27,6 +27,7 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
+from vdgs.sfm.view_stretch import Stretch, find_stretch, stretched, with_stretch
 from vdgs.sfm.up_direction import BY_ATTITUDES, model_centers, model_points, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -61,8 +62,10 @@ class Georeferenced:
     """Which cameras' angles are read otherwise than before."""
 
 
-def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool) -> Georeferenced:
-    """Bring a model, which may change, to metres east, north, up.
+def georeference(
+    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, held: tuple[bool, str]
+) -> Georeferenced:
+    """Bring a model, which may change, to metres east, north, up. `held`: whether its focal length was, and why.
 
     Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
     """
@@ -77,12 +80,14 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     doubtful = frozenset[str]()
     placed: Georegistration | AlignmentFailure
     if doubts is not None and control is not None and control.has_control_points:
-        model, placed, doubtful = _by_control(model, prepared, hold_focal, doubts)
+        model, placed, doubtful = _by_control(model, prepared, held[0], doubts)
     else:
+        model, stretch = _stretched(model, prepared, held)
         placed = _by_positions(model, prepared)
         if isinstance(placed, Georegistration):
+            placed = with_stretch(placed, stretch, model)
             georegistration.transform_model(model, placed.similarity)
-            model, placed = _bent(model, placed, prepared, hold_focal)
+            model, placed = _bent(model, placed, prepared, held[0] or stretch is not None)
     if isinstance(placed, AlignmentFailure):
         return Georeferenced(model, _upright(model, photographs, placed), None, (), control, photographs, notes)
     survey: tuple[GcpReport, ...] = ()
@@ -118,6 +123,27 @@ def _knows_altitude(prepared: ReconstructionPlan, placed: Georegistration) -> bo
     return used or (control is not None and control.has_heights)
 
 
+def _stretched(
+    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, held: tuple[bool, str]
+) -> tuple[pycolmap.Reconstruction, Stretch | None]:
+    """The model with the focal length and the heights that recorded heights and tags tell, where its own views are too
+    parallel to tell them."""
+    if prepared.request.options.georeference == "off":
+        return model, None
+    photographs, positions = prepared.image_list.images, prepared.gps_priors
+    stretch = find_stretch(model, photographs, positions, held, _are_stated(prepared))
+    if stretch is not None and stretch.log:
+        model = stretched(model, stretch, prepared.threads)
+        drop_unseen_observations(model)
+    return model, stretch
+
+
+def _are_stated(prepared: ReconstructionPlan) -> bool:
+    """Whether a person says how good the positions of a table are."""
+    request = prepared.request
+    return request.gps is not None and request.options.gps_std_m != SfmOptions.gps_std_m
+
+
 def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Georegistration | AlignmentFailure:
     photographs, positions, options = prepared.image_list.images, prepared.gps_priors, prepared.request.options
     scale = known_scale(model, prepared.scale_bars) if prepared.scale_bars is not None else None
@@ -125,7 +151,7 @@ def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) 
     if options.georeference == "off":
         placed: Georegistration | AlignmentFailure = AlignmentFailure("asked for: --georeference off", WITHOUT)
     else:
-        stated = prepared.request.gps is not None and options.gps_std_m != SfmOptions.gps_std_m
+        stated = _are_stated(prepared)
         alone = georegistration.georegister(model, photographs, positions, None, anyway, stated)
         placed = (
             alone

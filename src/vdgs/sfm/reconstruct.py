@@ -201,7 +201,7 @@ def _placed_again(prepared: ReconstructionPlan, before: ReconstructionReport) ->
     """The model of a finished capture where it belongs now. Nothing is written; raises CaptureError for positions,
     distances and control points that are refused, and for a lens that these fit to none that there is."""
     model = pycolmap.Reconstruction(prepared.request.output / MAPPED)
-    found = georeference(model, prepared, before.focal_fixed)
+    found = georeference(model, prepared, (before.focal_fixed, before.focal_reason))
     _lenses(found.model)
     return found
 
@@ -268,7 +268,7 @@ def _steps(
     )
     check_enough_placed(models[0], left_out)
     mapped = pycolmap.Reconstruction(models[0])
-    found = georeference(models[0], plan, held[0])
+    found = georeference(models[0], plan, held)
     discard_training(plan.request.output, run)
     _write(plan, workspace, mapped, found.model, keys["capture"], console)
     outcome = ReconstructionResult(
