@@ -27,8 +27,8 @@ from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
-from vdgs.sfm.view_stretch import Stretch, find_stretch, stretched, with_stretch
 from vdgs.sfm.up_direction import BY_ATTITUDES, model_centers, model_points, up_of
+from vdgs.sfm.view_stretch import Stretch, find_stretch, stretched, with_stretch
 from vdgs.system.lazy_pycolmap import pycolmap
 
 WITHOUT = (
@@ -60,11 +60,11 @@ class Georeferenced:
     """Those of the plan, with attitudes by the readings that the model confirms."""
     notes: tuple[str, ...] = ()
     """Which cameras' angles are read otherwise than before."""
+    focal_by: str = ""
+    """What told the focal length after the photographs could not; empty where nothing did."""
 
 
-def georeference(
-    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, held: tuple[bool, str]
-) -> Georeferenced:
+def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, held: tuple[bool, str]) -> Georeferenced:
     """Bring a model, which may change, to metres east, north, up. `held`: whether its focal length was, and why.
 
     Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
@@ -77,7 +77,7 @@ def georeference(
         prepared, of_heights = _with_height_unit(model, prepared, doubts)
         doubts, notes = replace(doubts, altitude=prepared.origin[2]), (*notes, *of_heights)
     control = prepared.gcps
-    doubtful = frozenset[str]()
+    doubtful, stretch = frozenset[str](), None
     placed: Georegistration | AlignmentFailure
     if doubts is not None and control is not None and control.has_control_points:
         model, placed, doubtful = _by_control(model, prepared, held[0], doubts)
@@ -102,7 +102,8 @@ def georeference(
     latitude, longitude, altitude = prepared.origin
     altitude = altitude + ground if _knows_altitude(prepared, placed) else 0.0
     origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
-    return Georeferenced(model, placed, origin, survey, control, photographs, notes)
+    focal_by = stretch.told_by if stretch is not None else ""
+    return Georeferenced(model, placed, origin, survey, control, photographs, notes, focal_by)
 
 
 def _upright(

@@ -282,9 +282,9 @@ def _place_error(
 
 
 def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
-    over = [
+    over = ", ".join(
         f"{two_digits(off, '+')} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different
-    ]
+    )
     up = fit.place_error_m[1]
     fixed = up < min(map(abs, offsets.different))  # by RTK alone (`_place_error`)
     good = (
@@ -292,10 +292,12 @@ def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
         if fixed
         else f"±{two_digits(up)} m"
     )
+    is_explained = fit.inliers[offsets.by_position != 0].any()
+    or_focal = "" if is_explained else ", or, flown at another height, by a focal length that is off"
     return [
-        f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?): {', '.join(over)} over "
-        f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the "
-        f"latter, good to {good}. A table of positions (--gps) with one datum mends it."
+        f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?){or_focal}: {over} over "
+        f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the latter, "
+        f"good to {good}. A table of positions (--gps) with one datum mends it."
     ]
 
 

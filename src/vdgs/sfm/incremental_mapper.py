@@ -165,8 +165,8 @@ def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np
 def release_focal(
     models: list[pycolmap.Reconstruction], held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
 ) -> tuple[bool, str]:
-    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE or OF_LINE but
-    the photographs alone tell it, unless it goes astray. Whether it is held then, and why. Several heights let
+    """Fit the focal length of the first of models, held for OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE or OF_LINE, where the
+    photographs alone tell it, unless it goes astray. Whether it is held then, and why. Several heights let
     photographs tell it only as far as views differ in direction (`focal_deviation`)."""
     if not held[0] or held[1] not in (OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE, OF_LINE):
         return held

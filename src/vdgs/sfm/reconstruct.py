@@ -54,6 +54,7 @@ from vdgs.sfm.reconstruction_report import (
     ReconstructionResult,
     check_enough_placed,
     exclusion_reasons,
+    focal_reason,
     make_reconstruction_report,
 )
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
@@ -234,7 +235,7 @@ def _place_anew(
         for photo in before.photographs
         if photo.excluded_reason is not None and photo.name not in known
     ]
-    held = before.focal_fixed, before.focal_reason
+    held = before.focal_fixed, focal_reason(before.focal_reason)
     seconds = time.monotonic() - began
     outcome = ReconstructionResult(
         camera_groups=kinds,

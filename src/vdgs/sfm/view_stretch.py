@@ -1,4 +1,4 @@
-"""The one factor for focal lengths and heights together that parallel views leave open, by all else that is known of it.
+"""The one factor for focal lengths and heights together that parallel views leave open, by all else that is known.
 
 Stretched along the views, with focal lengths as many times as long, a model of parallel views shows the same pixels.
 What photographs, tags and recorded heights each say of the factor is weighed by what it is good for. Factors are held
@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
-from vdgs.captures.position_adjustment import DRIFT_M
+from vdgs.captures.position_adjustment import DRIFT_M, PositionFit, Problem
 from vdgs.captures.position_fit import fit_positions
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.flights import FIXED_M, flights_of
 from vdgs.sfm.focal_information import focal_deviation
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
 from vdgs.sfm.georegistration import Georegistration, match_positions, problem_of, viewing_distance
-from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
+from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.incremental_mapper import ASKED, MIN_OBLIQUE_SHARE, adjust
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
@@ -29,11 +29,11 @@ from vdgs.sfm.up_direction import up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
 
-#: What a focal length is off by as tags say it: calibrated by the maker, confirmed by a second tag, by one tag (choice).
+#: What a focal length is off by as tags say it: calibrated by the maker, by two tags that agree, by one tag (choice).
 CALIBRATED_SHARE, SAID_SHARE, ONE_TAG_SHARE = 0.005, 0.015, 0.02
 #: Known better than this the factor is not looked into. By less than this nothing is stretched, and by less than such a
 #: share of what is left open (choice).
-KNOWN_SHARE, LEAST_LOG, LEAST_SHARE = 0.002, 5e-4, 0.25
+KNOWN_SHARE, LEAST_LOG, LEAST_SHARE = 5e-4, 5e-4, 0.25
 #: A receiver may be off by so many times what it is off by across, and a barometer by so many metres, between one
 #: height and another; and all heights of a barometer by such a share, in air that is not the standard one (choice).
 APART_ACROSS, BAROMETER_M, BAROMETER_SHARE = 4.0, 1.0, 0.02
@@ -42,9 +42,11 @@ APART_ACROSS, BAROMETER_M, BAROMETER_SHARE = 4.0, 1.0, 0.02
 PLAINLY_BETTER, APART_SIGMAS = 0.5, 3.0
 #: Views may be so far from straight down that recorded heights tell the factor (cosine; choice).
 DOWN_COSINE = 0.9
+#: Heights that leave more open (share) say nothing against a drift of altitudes (choice).
+TELLING = 0.1
 #: Rounds in which weights settle, and the degrees of freedom of Student's t by which errors spread.
 ROUNDS, TAILS = 15, 3.0
-BY_ALTITUDES, BY_BAROMETER = "recorded altitudes", "recorded heights over the take-off"
+BY_ALTITUDES, BY_BAROMETER, BY_TAGS = "recorded altitudes", "recorded heights over the take-off", "tags"
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,11 @@ class Stretch:
     how: str
     """By which heights it is known; empty where none tell it."""
 
+    @property
+    def told_by(self) -> str:
+        """What the focal length was changed by, in words; empty where it was not."""
+        return (self.how or BY_TAGS) if self.log else ""
+
 
 def find_stretch(
     model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata], positions: GpsPriors, held: tuple[bool, str],
@@ -100,10 +107,13 @@ def find_stretch(
         before = _joined([each for each in (Known(0.0, focal_deviation(model)), said) if each is not None])
     if before is not None and before.deviation <= KNOWN_SHARE:
         return None
-    heights = _by_heights(model, photographs, positions, axis, stated)
+    flown = _Flown.of(model, photographs, positions, axis, stated)
+    heights = None if flown is None else _by_heights(flown)
     found = _joined([each for each in (before, heights) if each is not None])
     if found is None:
         return None
+    if before is not None and heights is not None and flown is not None:
+        found = _likelier(found, before, heights, flown)
     if held[1] == ASKED:  # what speaks against it is its error
         return Stretch(axis, 0.0, math.hypot(found.deviation, found.log), found.how)
     is_much = abs(found.log) > max(LEAST_LOG, LEAST_SHARE * found.deviation)
@@ -127,19 +137,16 @@ def stretched(model: pycolmap.Reconstruction, stretch: Stretch, threads: int) ->
     return found
 
 
-def with_stretch(
-    placed: Georegistration, stretch: Stretch | None, model: pycolmap.Reconstruction
-) -> Georegistration:
+def with_stretch(placed: Georegistration, stretch: Stretch | None, model: pycolmap.Reconstruction) -> Georegistration:
     """The same with the accuracy that heights have where the factor is open, and notes of it. `model`: as it was
     placed, before it is moved."""
     if stretch is None or placed.accuracy is None:
         return placed
     notes, accuracy = list(placed.notes), placed.accuracy
     if stretch.log:
-        by = f"by {stretch.how}" if stretch.how else "by what tags say"
         notes.append(
-            f"the views are too parallel to tell the focal length from another height of all: {by} both are "
-            f"{math.expm1(stretch.log):+.2%} of what the photographs alone gave."
+            f"the views are too parallel to tell the focal length: by {stretch.told_by} it is "
+            f"{math.expm1(stretch.log):+.2%} from what it was, and so are heights."
         )
     away = 2 * stretch.deviation * placed.similarity.scale * viewing_distance(placed_images(model), model)
     across, *up = accuracy.place_m or ()
@@ -147,9 +154,9 @@ def with_stretch(
     if looks_down and up and math.isfinite(away):
         if away > up[0]:
             notes.append(
-                f"the views are too parallel to tell the focal length, which is known to ±{200 * stretch.deviation:.2g} %"
-                f" by {stretch.how or 'tags'}: the ground may lie {two_digits(away)} m higher or lower. Oblique views or "
-                "control points tell it."
+                "the views are too parallel, or all of one height, to tell the focal length, known to "
+                f"±{200 * stretch.deviation:.2g} % by {stretch.how or BY_TAGS}: the ground may lie "
+                f"{two_digits(away)} m higher or lower (95 %). Oblique views or control points tell it."
             )
         accuracy = replace(accuracy, place_m=(across, math.hypot(up[0], away)))
     return replace(placed, accuracy=accuracy, notes=tuple(notes))
@@ -190,39 +197,71 @@ def _said(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
     return Known(log, max(shares)) if alike(math.exp(log), 1.0) else None
 
 
-def _by_heights(
-    model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata], positions: GpsPriors, axis: np.ndarray,
-    stated: bool,
-) -> Known | None:  # fmt: skip
-    """What recorded altitudes, and heights over the take-off, say of the factor of a model whose views look down: by
-    how many times more they differ than heights by the photographs, where positions in the plane tell the scale."""
-    images = {image.name: image for image in placed_images(model)}
-    rows, centers, _ = match_positions(images, photographs, positions)
-    if not positions.usable or len(rows) < max(MIN_POSITIONS, ENOUGH_TO_DOUBT):
-        return None
-    taken = [photographs[int(positions.image_indices[row])] for row in rows]
-    up, _ = up_of(model, photographs)
-    problem = problem_of(taken, rows, centers, up, positions, stated=stated)
-    plane = fit_positions(replace(problem, has_altitudes=False))
-    if not up.sure or (plane.similarity.rotation @ axis)[2] > -DOWN_COSINE:
-        return None
-    across = float(plane.gps_std[:2].mean())
-    tilt = math.tan(math.radians(up.deviation_deg))
-    flights, places = flights_of(taken), plane.placed[plane.inliers]
-    found = list[Known]()
-    if positions.has_altitudes:
-        one_datum = bool((positions.gps_std[rows, 2] <= FIXED_M).all())
-        of_flight = np.zeros(len(rows), int) if one_datum else flights
-        apart = min(DRIFT_M, APART_ACROSS * across)
-        off = problem.targets[:, 2] - plane.placed[:, 2]
-        known = factor_of_heights(places, off[plane.inliers], of_flight[plane.inliers], tilt, apart)
-        found.append(replace(known, how=BY_ALTITUDES))
-    relative = np.array([math.nan if photo.relative_altitude is None else photo.relative_altitude for photo in taken])
+@dataclass(frozen=True, eq=False)
+class _Flown:
+    """Positions of a model whose views look down, and what they say in the plane."""
+
+    problem: Problem
+    plane: PositionFit
+    axis: np.ndarray
+    taken: Sequence[ImageMetadata]
+    up_std: np.ndarray
+    """What altitudes are said to be good for [m], metres."""
+
+    @classmethod
+    def of(
+        cls, model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata], positions: GpsPriors,
+        axis: np.ndarray, stated: bool,
+    ) -> _Flown | None:  # fmt: skip
+        """None where positions are few, and where views look elsewhere: heights tell nothing of how far walls are."""
+        images = {image.name: image for image in placed_images(model)}
+        rows, centers, _ = match_positions(images, photographs, positions)
+        if not positions.usable or len(rows) < ENOUGH_TO_DOUBT:
+            return None
+        taken = [photographs[int(positions.image_indices[row])] for row in rows]
+        up, _ = up_of(model, photographs)
+        problem = problem_of(taken, rows, centers, up, positions, stated=stated)
+        plane = fit_positions(replace(problem, has_altitudes=False))
+        looks_down = up.sure and (plane.similarity.rotation @ axis)[2] <= -DOWN_COSINE
+        return cls(problem, plane, axis, taken, positions.gps_std[rows, 2]) if looks_down else None
+
+    def cost(self, log: float) -> float:
+        """Negative log likelihood of the positions, were the model stretched by that."""
+        deeper = np.eye(3) + math.expm1(log) * np.outer(self.axis, self.axis)
+        return fit_positions(replace(self.problem, centers=self.problem.centers @ deeper)).score
+
+
+def _by_heights(flown: _Flown) -> Known | None:
+    """What recorded altitudes, and heights over the take-off, say of the factor: by how many times more they differ
+    than heights by the photographs, where positions in the plane tell the scale."""
+    inside, heights = flown.plane.inliers, flown.plane.placed[:, 2]
+    places, tilt = flown.plane.placed[inside], math.tan(math.radians(flown.problem.up.deviation_deg))
+    flights, found = flights_of(flown.taken), list[Known]()
+    if flown.problem.has_altitudes:
+        of_flight = np.zeros(len(heights), int) if (flown.up_std <= FIXED_M).all() else flights
+        apart = min(DRIFT_M, APART_ACROSS * float(flown.plane.gps_std[:2].mean()))
+        off = flown.problem.targets[:, 2] - heights
+        found.append(replace(factor_of_heights(places, off[inside], of_flight[inside], tilt, apart), how=BY_ALTITUDES))
+    recorded = [math.nan if photo.relative_altitude is None else photo.relative_altitude for photo in flown.taken]
+    relative = np.array(recorded, float)
     if np.isfinite(relative).all() and np.ptp(relative):
-        off = (relative - plane.placed[:, 2])[plane.inliers]
-        known = factor_of_heights(places, off, flights[plane.inliers], tilt, BAROMETER_M)
+        known = factor_of_heights(places, (relative - heights)[inside], flights[inside], tilt, BAROMETER_M)
         found.append(Known(known.log, math.hypot(known.deviation, BAROMETER_SHARE), BY_BAROMETER))
     return _joined(found)
+
+
+def _likelier(found: Known, before: Known, heights: Known, flown: _Flown) -> Known:
+    """What is found, or the factor of heights alone where that is likelier than altitudes which drift, step or are of
+    no use. What is left open is no less for that."""
+    if heights.how != BY_ALTITUDES or heights.deviation > TELLING:
+        return found
+
+    def cost(log: float) -> float:
+        return flown.cost(log) + 0.5 * ((log - before.log) / before.deviation) ** 2
+
+    if found.log == heights.log or cost(heights.log) >= cost(found.log):
+        return found
+    return Known(heights.log, math.hypot(found.deviation, (heights.log - found.log) / 2), BY_ALTITUDES)
 
 
 def _joined(known: Sequence[Known]) -> Known | None:
@@ -231,12 +270,10 @@ def _joined(known: Sequence[Known]) -> Known | None:
     return known[0].joined(known[1]) if len(known) == 2 else known[0] if known else None
 
 
-def factor_of_heights(
-    places: np.ndarray, off: np.ndarray, flights: np.ndarray, tilt: float, apart_m: float
-) -> Known:
-    """By how many times more recorded heights differ than those of places [n, 3], which they lie over by `off` [n]. Each
-    flight [n] may count from another zero, level may be off by `tilt` (tangent), and heights of one level against those
-    of another by `apart_m`. A deviation that is infinite where they do not tell it."""
+def factor_of_heights(places: np.ndarray, off: np.ndarray, flights: np.ndarray, tilt: float, apart_m: float) -> Known:
+    """By how many times more recorded heights differ than those of places [n, 3], which they exceed by `off` [n]. Each
+    flight may count from another zero, level may be off by `tilt` (tangent), and heights of one level against those
+    of another by `apart_m`. An infinite deviation where they do not tell it."""
     none = Known(0.0, math.inf)
     zeros = flights[:, None] == np.unique(flights)
     level = places[:, :2] - places[:, :2].mean(axis=0)
@@ -258,6 +295,6 @@ def factor_of_heights(
     slope, gain = float(gains[-1] @ off), gains[-1]
     if slope <= -0.5 or math.sqrt(np.linalg.inv(normal)[-1, -1]) >= PLAINLY_BETTER:
         return none
-    higher = height > (height.min() + height.max()) / 2
-    deviation = math.hypot(sigma * float(np.linalg.norm(gain)), apart_m * abs(float(gain[higher].sum())))
+    # The gains sum up to 0, as one zero is fitted: those above it take half of what two levels differ by.
+    deviation = math.hypot(sigma * float(np.linalg.norm(gain)), apart_m * float(np.abs(gain).sum()) / 2)
     return Known(math.log1p(slope), deviation / (1 + slope))
