@@ -285,7 +285,7 @@ def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
     over = ", ".join(
         f"{two_digits(off, '+')} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different
     )
-    up = fit.place_error_m[1]
+    up, others = fit.place_error_m[1], int(offsets.reference.sum())
     fixed = up < min(map(abs, offsets.different))  # by RTK alone (`_place_error`)
     good = (
         f"±{two_digits(up)} m above their own zero, be it the ellipsoid (RTK) or the sea"
@@ -296,8 +296,8 @@ def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
     or_focal = "" if is_explained else ", or, flown at another height, by a focal length that is off"
     return [
         f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?){or_focal}: {over} over "
-        f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the latter, "
-        f"good to {good}. A table of positions (--gps) with one datum mends it."
+        f"those of the other {others}. That is left out; heights above the sea are those of the latter, good to {good}."
+        " A table of positions (--gps) with one datum mends it."
     ]
 
 
