@@ -143,7 +143,7 @@ def test_heights_tell_the_factor_within_a_flight_and_not_along_a_slope(flights, 
 
 
 def test_what_is_plainly_better_counts_alone_and_others_by_what_they_are_good_for():
-    tags = Known(0.0, 0.02)
+    tags = Known(0.0, 0.02, "tags")
     assert tags.joined(Known(0.03, 0.005, "heights")) == Known(0.03, 0.005, "heights")
     both = tags.joined(Known(0.03, 0.02, "heights"))
     assert both.log == pytest.approx(0.015)

@@ -46,7 +46,8 @@ DOWN_COSINE = 0.9
 TELLING = 0.1
 #: Rounds in which weights settle, and the degrees of freedom of Student's t by which errors spread.
 ROUNDS, TAILS = 15, 3.0
-BY_ALTITUDES, BY_BAROMETER, BY_TAGS = "recorded altitudes", "recorded heights over the take-off", "tags"
+BY_ALTITUDES, BY_BAROMETER = "recorded altitudes", "recorded heights over the take-off"
+BY_TAGS, BY_PHOTOGRAPHS = "tags", "the photographs"
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Known:
 
     log: float
     deviation: float
-    how: str = ""
+    how: str
 
     def joined(self, other: Known) -> Known:
         """Both, each by what it is good for; one alone where it is plainly better, and where they contradict."""
@@ -65,7 +66,7 @@ class Known:
             return best
         weight = (rest.deviation / both) ** 2
         log = weight * best.log + (1 - weight) * rest.log
-        return Known(log, best.deviation * rest.deviation / both, best.how or rest.how)
+        return Known(log, best.deviation * rest.deviation / both, best.how)
 
 
 @dataclass(frozen=True)
@@ -79,12 +80,12 @@ class Stretch:
     deviation: float
     """What is left open after that."""
     how: str
-    """By which heights it is known; empty where none tell it."""
+    """By what it is known best."""
 
     @property
     def told_by(self) -> str:
         """What the focal length was changed by, in words; empty where it was not."""
-        return (self.how or BY_TAGS) if self.log else ""
+        return self.how if self.log else ""
 
 
 def find_stretch(
@@ -102,9 +103,11 @@ def find_stretch(
         return None
     said = _said(model, photographs)
     if held[0]:  # for something says it
-        before: Known | None = said or Known(0.0, ONE_TAG_SHARE)
+        before: Known | None = said or Known(0.0, ONE_TAG_SHARE, BY_TAGS)
     else:
-        before = _joined([each for each in (Known(0.0, focal_deviation(model)), said) if each is not None])
+        before = _joined(
+            [each for each in (Known(0.0, focal_deviation(model), BY_PHOTOGRAPHS), said) if each is not None]
+        )
     if before is not None and before.deviation <= KNOWN_SHARE:
         return None
     flown = _Flown.of(model, photographs, positions, axis, stated)
@@ -155,7 +158,7 @@ def with_stretch(placed: Georegistration, stretch: Stretch | None, model: pycolm
         if away > up[0]:
             notes.append(
                 "the views are too parallel, or all of one height, to tell the focal length, known to "
-                f"±{200 * stretch.deviation:.2g} % by {stretch.how or BY_TAGS}: the ground may lie "
+                f"±{200 * stretch.deviation:.2g} % by {stretch.how}: the ground may lie "
                 f"{two_digits(away)} m higher or lower (95 %). Oblique views or control points tell it."
             )
         accuracy = replace(accuracy, place_m=(across, math.hypot(up[0], away)))
@@ -194,7 +197,7 @@ def _said(model: pycolmap.Reconstruction, photographs: Sequence[ImageMetadata]) 
     if 2 * len(logs) < count:
         return None
     log = float(np.median(logs))
-    return Known(log, max(shares)) if alike(math.exp(log), 1.0) else None
+    return Known(log, max(shares), BY_TAGS) if alike(math.exp(log), 1.0) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +244,7 @@ def _by_heights(flown: _Flown) -> Known | None:
         of_flight = np.zeros(len(heights), int) if (flown.up_std <= FIXED_M).all() else flights
         apart = min(DRIFT_M, APART_ACROSS * float(flown.plane.gps_std[:2].mean()))
         off = flown.problem.targets[:, 2] - heights
-        found.append(replace(factor_of_heights(places, off[inside], of_flight[inside], tilt, apart), how=BY_ALTITUDES))
+        found.append(factor_of_heights(places, off[inside], of_flight[inside], tilt, apart))
     recorded = [math.nan if photo.relative_altitude is None else photo.relative_altitude for photo in flown.taken]
     relative = np.array(recorded, float)
     if np.isfinite(relative).all() and np.ptp(relative):
@@ -274,7 +277,7 @@ def factor_of_heights(places: np.ndarray, off: np.ndarray, flights: np.ndarray, 
     """By how many times more recorded heights differ than those of places [n, 3], which they exceed by `off` [n]. Each
     flight may count from another zero, level may be off by `tilt` (tangent), and heights of one level against those
     of another by `apart_m`. An infinite deviation where they do not tell it."""
-    none = Known(0.0, math.inf)
+    none = Known(0.0, math.inf, BY_ALTITUDES)
     zeros = flights[:, None] == np.unique(flights)
     level = places[:, :2] - places[:, :2].mean(axis=0)
     height = places[:, 2] - places[:, 2].mean()
@@ -297,4 +300,4 @@ def factor_of_heights(places: np.ndarray, off: np.ndarray, flights: np.ndarray, 
         return none
     # The gains sum up to 0, as one zero is fitted: those above it take half of what two levels differ by.
     deviation = math.hypot(sigma * float(np.linalg.norm(gain)), apart_m * float(np.abs(gain).sum()) / 2)
-    return Known(math.log1p(slope), deviation / (1 + slope))
+    return Known(math.log1p(slope), deviation / (1 + slope), BY_ALTITUDES)
