@@ -228,10 +228,10 @@ class _Flown:
         looks_down = up.sure and (plane.similarity.rotation @ axis)[2] <= -DOWN_COSINE
         return cls(problem, plane, axis, taken, positions.gps_std[rows, 2]) if looks_down else None
 
-    def cost(self, log: float) -> float:
-        """Negative log likelihood of the positions, were the model stretched by that."""
+    def fit(self, log: float) -> PositionFit:
+        """To positions, were the model stretched by that."""
         deeper = np.eye(3) + math.expm1(log) * np.outer(self.axis, self.axis)
-        return fit_positions(replace(self.problem, centers=self.problem.centers @ deeper)).score
+        return fit_positions(replace(self.problem, centers=self.problem.centers @ deeper))
 
 
 def _by_heights(flown: _Flown) -> Known | None:
@@ -254,15 +254,14 @@ def _by_heights(flown: _Flown) -> Known | None:
 
 
 def _likelier(found: Known, before: Known, heights: Known, flown: _Flown) -> Known:
-    """What is found, or the factor of heights alone where that is likelier than altitudes which drift, step or are of
-    no use. What is left open is no less for that."""
-    if heights.how != BY_ALTITUDES or heights.deviation > TELLING:
+    """What is found, or the factor of heights alone where altitudes would drift or be of no use by the former, are not
+    by the latter, and that is likelier. What is left open is no less for that."""
+    if heights.how != BY_ALTITUDES or heights.deviation > TELLING or found.log == heights.log:
         return found
-
-    def cost(log: float) -> float:
-        return flown.cost(log) + 0.5 * ((log - before.log) / before.deviation) ** 2
-
-    if found.log == heights.log or cost(heights.log) >= cost(found.log):
+    fits = {log: flown.fit(log) for log in (found.log, heights.log)}
+    costs = {log: fit.score + 0.5 * ((log - before.log) / before.deviation) ** 2 for log, fit in fits.items()}
+    is_needed = fits[found.log].altitude != "used" and fits[heights.log].altitude == "used"
+    if not is_needed or costs[heights.log] >= costs[found.log]:
         return found
     return Known(heights.log, math.hypot(found.deviation, (heights.log - found.log) / 2), BY_ALTITUDES)
 
