@@ -22,7 +22,7 @@ from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.incremental_mapper import ASKED, OF_HEIGHTS, OF_PARALLEL, OF_SHAPE, release_focal
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
-from vdgs.sfm.reconstruction_report import _flown_heights, _relief_explains, focal_reason
+from vdgs.sfm.reconstruction_report import _advice, _flown_heights, _relief_explains, focal_reason
 from vdgs.sfm.view_stretch import SAID_SHARE, Known, Stretch, factor_of_heights, stretched
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -175,3 +175,11 @@ def test_a_report_says_once_what_told_the_focal_length():
     assert said == f"{OF_PARALLEL}; then by recorded altitudes"
     assert focal_reason(said, "tags") == f"{OF_PARALLEL}; then by tags"
     assert focal_reason(said) == OF_PARALLEL == incremental_mapper.OF_PARALLEL
+
+
+def test_the_advice_promises_nothing_of_a_second_height_but_what_recorded_heights_tell():
+    look = SimpleNamespace(forward_overlap=None, views_per_point=None, oblique=0)
+    [advice] = _advice(look, True, 10, 10)
+    assert "oblique views" in advice
+    assert "by the recorded heights alone" in advice
+    assert not _advice(look, False, 10, 10)
