@@ -149,7 +149,7 @@ def georeferenced(
         request=SimpleNamespace(options=SfmOptions(), gps=None), image_list=ImageList((), tuple(photographs), (), 0),
         gps_priors=positions, preflight=SimpleNamespace(height_m=None), threads=1, pairs=0,
     )  # fmt: skip
-    found = georeference(pycolmap.Reconstruction(model), plan, True)
+    found = georeference(pycolmap.Reconstruction(model), plan, (True, "one height"))
     before, after = (
         stacked([Attitude(each.find_image_with_name(photo.name).cam_from_world().rotation.matrix())
                  for photo in photographs])

@@ -59,7 +59,7 @@ def georeferenced(
         image_list=ImageList((), tuple(photographs), (), 0), gps_priors=positions,
         preflight=SimpleNamespace(height_m=None), threads=1, pairs=0, gcps=gcps, scale_bars=bars,
     )  # fmt: skip
-    return georeference(model, prepared, True)
+    return georeference(model, prepared, (True, "one height"))
 
 
 @pytest.fixture

@@ -280,13 +280,18 @@ def test_a_point_that_does_not_fit_and_marks_that_are_wrong_are_named(made, flig
     assert pytest.approx(facts.height_m, abs=4) == ALTITUDE_M
 
 
-@pytest.mark.parametrize(("spread", "held"), [(incremental_mapper.MIN_HEIGHT_SPREAD, True), (0.0, False)])
+@pytest.mark.parametrize(
+    ("spread", "open_", "held"),
+    [(incremental_mapper.MIN_HEIGHT_SPREAD, 0.001, True), (0.0, 0.001, False), (0.0, 0.1, True)],
+)
 def test_a_focal_length_that_altitudes_leave_open_is_fitted_where_the_model_shows_several_heights(
-    made, monkeypatch, spread, held
+    made, monkeypatch, spread, open_, held
 ):
+    """And where its views differ enough in direction to tell it."""
     model = pycolmap.Reconstruction(made / "mapped")
     before = [camera.params.copy() for camera in model.cameras.values()]
     monkeypatch.setattr(incremental_mapper, "MIN_HEIGHT_SPREAD", spread)  # any height is another one
+    monkeypatch.setattr(incremental_mapper, "focal_deviation", lambda _: open_)
     found = incremental_mapper.release_focal([model], (True, incremental_mapper.OF_FLIGHTS), [], 1)
     assert found[0] is held
     after = [camera.params for camera in model.cameras.values()]

@@ -30,7 +30,7 @@ from vdgs.sfm.image_metadata import (
     attitude_from_gimbal,
     read_image_metadata,
 )
-from vdgs.sfm.incremental_mapper import TAGS_DISAGREE, should_fix_focal
+from vdgs.sfm.incremental_mapper import OF_HEIGHTS, TAGS_DISAGREE, should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings
@@ -494,7 +494,10 @@ def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
     unknown = [replace(photo, lens=None) for photo in seen]
     where = positions_of(seen)
     held = [should_fix_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
-    assert held == [True, False, False, False]
+    assert held == [True, False, True, False]  # parallel views tell it from no number of heights
+    assert should_fix_focal(heights, where, SfmOptions())[1] == OF_HEIGHTS
+    no_angles = [replace(photo, attitude=None) for photo in heights]
+    assert not should_fix_focal(no_angles, where, SfmOptions())[0]
     strips = flight(tmp_path, 12)
     north_m = np.array([photo.lat_lon[0] for photo in strips]) * 111_000
     slope = [
@@ -506,7 +509,7 @@ def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
         replace(photo, relative_altitude=10.0 + 5 * k, lat_lon=(seen[0].lat_lon[0] + 1e-6 * k, seen[0].lat_lon[1]))
         for k, photo in enumerate(strips)
     ]
-    assert not should_fix_focal(ascent, where, SfmOptions())[0]
+    assert should_fix_focal(ascent, where, SfmOptions()) == (True, OF_HEIGHTS)  # no slope is so steep
     assert should_fix_focal(oblique, where, SfmOptions(focal="fixed"))[0]
 
 

@@ -46,7 +46,7 @@ def flown_model(
         photographs.append(
             SimpleNamespace(
                 name=name, attitude=attitude, true_rotation=rotation, relative_altitude=None, datetime="",
-                subsecond=None, face="", altitude=None, attitudes={},
+                subsecond=None, face="", altitude=None, attitudes={}, lens=None, size=(WIDTH, HEIGHT), camera="",
             )
         )  # fmt: skip
     for point, track in zip(ground, seen, strict=True):

@@ -32,6 +32,8 @@ DIGESTS_FILE = "digests.json"
 FRAMES_FOLDER, FILMS_FILE = "frames", "films.json"
 #: The stage of a run that makes a capture of photographs, as `vdgs status` names it.
 SFM_STAGE = "photographs"
+#: What flying heights are over.
+OVER_MEDIAN, OVER_GROUND = "the median point", "the ground below each camera"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +138,7 @@ class ReconstructionReport:
     focal_fixed: bool
     focal_reason: str
     height_m: float | None
-    """Median height of the cameras over the median point."""
+    """Median height of the cameras over what `height_over` says."""
     recorded_height_m: float | None
     tilt_deg: float | None
     """Median angle of the views to straight down."""
@@ -155,7 +157,9 @@ class ReconstructionReport:
     up: str = ""
     """By what z is up in a world without metres; empty where nothing tells, and for worlds with metres."""
     heights_m: tuple[float, ...] | None = None
-    """The lowest and the highest camera over the median point, where they fly at several heights."""
+    """The lowest and the highest camera, where they fly at several heights."""
+    height_over: str = OVER_MEDIAN
+    """What these heights are over: the ground itself where the flight follows it up and down."""
     flown: tuple[str, ...] = ()
     """When the first and the last photograph were taken, as EXIF has it; empty where it says nothing."""
 
@@ -243,9 +247,12 @@ def report_rows(metadata: ReconstructionReport) -> list[tuple[str, str]]:
             )
         )
     if metadata.height_m is not None:
-        recorded = f", {metadata.recorded_height_m:.1f} m recorded" if metadata.recorded_height_m is not None else ""
+        take_off = " over the take-off" if metadata.height_over == OVER_GROUND else ""
+        recorded = (
+            f", {metadata.recorded_height_m:.1f} m recorded{take_off}" if metadata.recorded_height_m is not None else ""
+        )
         height = flying_height(metadata.height_m, metadata.heights_m)
-        rows.append(("Flying height", f"{height} over the median point{recorded}"))
+        rows.append(("Flying height", f"{height} over {metadata.height_over}{recorded}"))
     if metadata.tilt_deg is not None:
         against = metadata.attitude_difference_deg
         recorded = f"; down is {against:.1f}° from what the drone recorded" if against is not None else ""

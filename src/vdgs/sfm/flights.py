@@ -132,14 +132,15 @@ def altitude_offsets(
 
 def untrusted_offsets(off: np.ndarray, trusted: np.ndarray, labels: np.ndarray) -> AltitudeOffsets | None:
     """The same of flights none of whose positions is `trusted` [n], by how far recorded altitudes are above the placed
-    ones [n]: where one drifts, no single datum explains it, and its median is told. None where all are near."""
-    over = np.zeros(len(off))
+    ones [n]: where one drifts, no single datum explains it, and its median is told; also where all of a flight at
+    another height are off alike. None where none is, beyond what trusted ones differ by."""
+    over, usual = np.zeros(len(off)), float(np.std(off[trusted])) if trusted.any() else 0.0
     for flight in np.unique(labels[~trusted]):
         here = labels == flight
         apart = float(np.median(off[here]))
         error = 1.25 * float(np.std(off[here])) / np.sqrt(here.sum())
         enough = here.sum() >= LEAST_PHOTOGRAPHS and not trusted[here].any()
-        if enough and abs(apart) > max(LEAST_OFFSET_M, LEAST_SIGMAS * error):
+        if enough and abs(apart) > LEAST_SIGMAS * max(error, usual):
             over[here] = apart
     return AltitudeOffsets(over, trusted) if over.any() else None
 

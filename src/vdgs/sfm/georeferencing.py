@@ -28,6 +28,7 @@ from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
 from vdgs.sfm.up_direction import BY_ATTITUDES, model_centers, model_points, up_of
+from vdgs.sfm.view_stretch import Stretch, find_stretch, stretched, with_stretch
 from vdgs.system.lazy_pycolmap import pycolmap
 
 WITHOUT = (
@@ -59,10 +60,12 @@ class Georeferenced:
     """Those of the plan, with attitudes by the readings that the model confirms."""
     notes: tuple[str, ...] = ()
     """Which cameras' angles are read otherwise than before."""
+    focal_by: str = ""
+    """What told the focal length after the photographs could not; empty where nothing did."""
 
 
-def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, hold_focal: bool) -> Georeferenced:
-    """Bring a model, which may change, to metres east, north, up.
+def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, held: tuple[bool, str]) -> Georeferenced:
+    """Bring a model, which may change, to metres east, north, up. `held`: whether its focal length was, and why.
 
     Raises CaptureError for what contradicts itself or the photographs: then nothing should be written.
     """
@@ -74,15 +77,17 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
         prepared, of_heights = _with_height_unit(model, prepared, doubts)
         doubts, notes = replace(doubts, altitude=prepared.origin[2]), (*notes, *of_heights)
     control = prepared.gcps
-    doubtful = frozenset[str]()
+    doubtful, stretch = frozenset[str](), None
     placed: Georegistration | AlignmentFailure
     if doubts is not None and control is not None and control.has_control_points:
-        model, placed, doubtful = _by_control(model, prepared, hold_focal, doubts)
+        model, placed, doubtful = _by_control(model, prepared, held[0], doubts)
     else:
+        model, stretch = _stretched(model, prepared, held)
         placed = _by_positions(model, prepared)
         if isinstance(placed, Georegistration):
+            placed = with_stretch(placed, stretch, model)
             georegistration.transform_model(model, placed.similarity)
-            model, placed = _bent(model, placed, prepared, hold_focal)
+            model, placed = _bent(model, placed, prepared, held[0] or stretch is not None)
     if isinstance(placed, AlignmentFailure):
         return Georeferenced(model, _upright(model, photographs, placed), None, (), control, photographs, notes)
     survey: tuple[GcpReport, ...] = ()
@@ -97,7 +102,8 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
     latitude, longitude, altitude = prepared.origin
     altitude = altitude + ground if _knows_altitude(prepared, placed) else 0.0
     origin = (latitude, longitude, altitude) if placed.is_georeferenced else None
-    return Georeferenced(model, placed, origin, survey, control, photographs, notes)
+    focal_by = stretch.told_by if stretch is not None else ""
+    return Georeferenced(model, placed, origin, survey, control, photographs, notes, focal_by)
 
 
 def _upright(
@@ -118,6 +124,27 @@ def _knows_altitude(prepared: ReconstructionPlan, placed: Georegistration) -> bo
     return used or (control is not None and control.has_heights)
 
 
+def _stretched(
+    model: pycolmap.Reconstruction, prepared: ReconstructionPlan, held: tuple[bool, str]
+) -> tuple[pycolmap.Reconstruction, Stretch | None]:
+    """The model with the focal length and the heights that recorded heights and tags tell, where its own views are too
+    parallel to tell them."""
+    if prepared.request.options.georeference == "off":
+        return model, None
+    photographs, positions = prepared.image_list.images, prepared.gps_priors
+    stretch = find_stretch(model, photographs, positions, held, _are_stated(prepared))
+    if stretch is not None and stretch.log:
+        model = stretched(model, stretch, prepared.threads)
+        drop_unseen_observations(model)
+    return model, stretch
+
+
+def _are_stated(prepared: ReconstructionPlan) -> bool:
+    """Whether a person says how good the positions of a table are."""
+    request = prepared.request
+    return request.gps is not None and request.options.gps_std_m != SfmOptions.gps_std_m
+
+
 def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) -> Georegistration | AlignmentFailure:
     photographs, positions, options = prepared.image_list.images, prepared.gps_priors, prepared.request.options
     scale = known_scale(model, prepared.scale_bars) if prepared.scale_bars is not None else None
@@ -125,7 +152,7 @@ def _by_positions(model: pycolmap.Reconstruction, prepared: ReconstructionPlan) 
     if options.georeference == "off":
         placed: Georegistration | AlignmentFailure = AlignmentFailure("asked for: --georeference off", WITHOUT)
     else:
-        stated = prepared.request.gps is not None and options.gps_std_m != SfmOptions.gps_std_m
+        stated = _are_stated(prepared)
         alone = georegistration.georegister(model, photographs, positions, None, anyway, stated)
         placed = (
             alone

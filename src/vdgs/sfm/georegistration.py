@@ -9,7 +9,7 @@ import numpy as np
 
 from vdgs.captures.gps_altitudes import refuse_unit, wrong_reading, wrong_unit
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_adjustment import DRIFT_COSTS, DRIFT_M, STATED_TIMES, PositionFit, Problem
+from vdgs.captures.position_adjustment import DRIFT_COSTS, DRIFT_M, STATED_TIMES, PositionFit, Problem, Up
 from vdgs.captures.position_fit import OTHER_COSINE, fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
@@ -92,26 +92,15 @@ def georegister(
     Raises CaptureError, unless `anyway`, for positions that fit only once they are mirrored or exchanged.
     """
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    rows, centers, targets = _match_positions(images, images_metadata, positions)
+    rows, centers, targets = match_positions(images, images_metadata, positions)
     if not positions.usable or len(rows) < MIN_POSITIONS:
         few = f"{len(rows)} positions of placed photographs are too few, {MIN_POSITIONS} are needed"
         return AlignmentFailure(few if len(positions) else "no positions that can be used", ADVICE_WRITE_GPS)
     up, notes = up_of(model, images_metadata)
     taken = [images_metadata[int(positions.image_indices[row])] for row in rows]
-    deviations, are_known = _deviations(positions, rows, stated)
-    problem = Problem(
-        centers=centers,
-        targets=targets,
-        times=_moments(taken),
-        flights=positions.flights[rows] if len(positions.flights) == len(positions) else None,
-        up=up,
-        scale=scale,
-        stated=deviations if are_known else None,
-        relative=relative_deviations(deviations),
-        has_altitudes=positions.has_altitudes,
-    )
+    problem = problem_of(taken, rows, centers, up, positions, scale, stated)
     problem, in_doubt = with_likelier_up(problem)
-    far = _viewing_distance(list(images.values()), model)
+    far = viewing_distance(list(images.values()), model)
     levelled, offsets = _without_offsets(problem, positions, rows, far)
     fit, barometer, over_ground = _best_fit(levelled, taken)
     wrong = _mirrored(fit, replace(problem, up=up), images, positions)
@@ -152,6 +141,25 @@ def georegister(
         deviations=fit.deviations,
         accuracy=accuracy,
         notes=tuple(notes),
+    )
+
+
+def problem_of(
+    taken: Sequence[ImageMetadata], rows: np.ndarray, centers: np.ndarray, up: Up, positions: GpsPriors,
+    scale: tuple[float, float] | None = None, stated: bool = False,
+) -> Problem:  # fmt: skip
+    """What is to be solved for photographs at centers [m, 3] that have the positions in `rows` [m]."""
+    deviations, are_known = _deviations(positions, rows, stated)
+    return Problem(
+        centers=centers,
+        targets=positions.enu[rows],
+        times=_moments(taken),
+        flights=positions.flights[rows] if len(positions.flights) == len(positions) else None,
+        up=up,
+        scale=scale,
+        stated=deviations if are_known else None,
+        relative=relative_deviations(deviations),
+        has_altitudes=positions.has_altitudes,
     )
 
 
@@ -210,7 +218,7 @@ def accuracy_of(
     )  # fmt: skip
 
 
-def _viewing_distance(images: Sequence[pycolmap.Image], model: pycolmap.Reconstruction) -> float:
+def viewing_distance(images: Sequence[pycolmap.Image], model: pycolmap.Reconstruction) -> float:
     """How far from the cameras lies what they see, in the model's unit: the median of some photographs."""
     depths = []
     for image in images[:: max(1, len(images) // VIEWS_LOOKED_AT)]:
@@ -276,20 +284,22 @@ def _place_error(
 
 
 def _of_offsets(offsets: AltitudeOffsets, fit: PositionFit) -> list[str]:
-    over = [
+    over = ", ".join(
         f"{two_digits(off, '+')} m ({int((offsets.by_position == off).sum())} photographs)" for off in offsets.different
-    ]
-    up = fit.place_error_m[1]
+    )
+    up, others = fit.place_error_m[1], int(offsets.reference.sum())
     fixed = up < min(map(abs, offsets.different))  # by RTK alone (`_place_error`)
     good = (
         f"±{two_digits(up)} m above their own zero, be it the ellipsoid (RTK) or the sea"
         if fixed
         else f"±{two_digits(up)} m"
     )
+    is_explained = fit.inliers[offsets.by_position != 0].any()
+    or_focal = "" if is_explained else ", or, flown at another height, by a focal length that is off"
     return [
-        f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?): {', '.join(over)} over "
-        f"those of the other {int(offsets.reference.sum())}. That is left out; heights above the sea are those of the "
-        f"latter, good to {good}. A table of positions (--gps) with one datum mends it."
+        f"the altitudes of flights differ by their datum (sea level, ellipsoid, take-off?){or_focal}: {over} over "
+        f"those of the other {others}. That is left out; heights above the sea are those of the latter, good to {good}."
+        " A table of positions (--gps) with one datum mends it."
     ]
 
 
@@ -410,7 +420,7 @@ def registration_in_place(
 ) -> Georegistration:
     """A model that was brought to its place by other things than positions, and how far those are from it."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    rows, centers, targets = _match_positions(images, photographs, positions)
+    rows, centers, targets = match_positions(images, photographs, positions)
     stays = Similarity(1.0, np.eye(3), np.zeros(3))
     return Georegistration(
         similarity=stays,
@@ -438,7 +448,7 @@ def transform_model(model: pycolmap.Reconstruction, similarity: Similarity) -> N
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
 
 
-def _match_positions(
+def match_positions(
     images: Mapping[str, pycolmap.Image], photographs: Sequence[ImageMetadata], positions: GpsPriors
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows [m] of the positions whose photographs are placed, where those were placed [m, 3], and the positions."""

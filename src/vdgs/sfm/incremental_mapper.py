@@ -20,6 +20,7 @@ from vdgs.geometry.geodesy import SEMI_MAJOR_M
 from vdgs.sfm.capture_writer import is_impossible, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
+from vdgs.sfm.focal_information import focal_deviation
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
 from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
@@ -29,7 +30,8 @@ from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_er
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
 from vdgs.system.lazy_pycolmap import pycolmap
 
-#: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
+#: So many oblique views let a flight tell the focal length. Heights that differ by so much of the flying height are
+#: several (choice).
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
 #: So many positions and more tell the slope that a flight follows (choice).
 MIN_FOR_SLOPE = 8
@@ -39,8 +41,10 @@ STEEPEST = 2.0
 OF_FLIGHTS = "each flight is level within the errors of altitudes; the model will show whether flights differ in height"
 OF_SLOPE = "one height over a slope, or a climb over level ground; the model will show which"
 OF_LINE = "along one line, which cannot tell it while views are parallel; the model will show whether they are"
-#: Why it is fitted then.
-OF_SHAPE = "several heights or views, as the photographs themselves show, which tell it"
+OF_HEIGHTS = "several heights, straight down as recorded, which parallel views cannot tell from another focal length"
+#: Why it is fitted or stays held then.
+OF_SHAPE = "views of several directions, as the photographs themselves show, which tell it"
+OF_PARALLEL = "several heights, but views so parallel that the photographs cannot tell it"
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
 ASKED = "asked for"
 TAGS_DISAGREE = "what the photographs say of it contradicts itself"
@@ -56,6 +60,9 @@ ERRORS_RANGE = 3.29
 ORBIT_RADIUS_SHARE = 0.8
 #: Positions along one line spread across it by no more than this share of how far they spread along it (choice).
 LINE_SHARE = 0.05
+#: Of several heights photographs tell the focal length where they leave less open than this (one standard deviation, as
+#: a share): half of what EXIF's is off by as a rule (`view_stretch.SAID_SHARE`; choice).
+TOLD_SHARE = 0.0075
 #: Parallel views along a line tell the focal length where points lie nearer by this share once it is fitted: by less
 #: than 0.3 % where they do not tell it, by 2 % and more where cameras that sway by 3 degrees do (choice).
 NEARER_ON_LINE = 0.02
@@ -115,7 +122,9 @@ def _by_flight(photographs: Sequence[ImageMetadata], bent: bool) -> tuple[bool, 
                 return True, OF_FLIGHTS
             if _range(_over_slope(heights, known)) <= steady:
                 return True, OF_SLOPE
-            return False, "flown at several heights, which tell it"
+            if 2 * len(tilts) >= len(photographs):
+                return True, OF_HEIGHTS
+            return False, "flown at several heights; nothing says that all views were parallel"
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
         return True, "one height, straight down as far as known: the flight cannot tell it"
     return None
@@ -157,10 +166,10 @@ def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np
 def release_focal(
     models: list[pycolmap.Reconstruction], held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
 ) -> tuple[bool, str]:
-    """Fit the focal length of the first of models, where it was held for OF_FLIGHTS, OF_SLOPE or OF_LINE but the
-    photographs alone show that they were taken from several heights or look several ways, unless it goes astray.
-    Whether it is held then, and why."""
-    if not held[0] or held[1] not in (OF_FLIGHTS, OF_SLOPE, OF_LINE):
+    """Fit the focal length of the first of models, held for OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE or OF_LINE, where the
+    photographs alone tell it, unless it goes astray. Whether it is held then, and why. Several heights let
+    photographs tell it only as far as views differ in direction (`focal_deviation`)."""
+    if not held[0] or held[1] not in (OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE, OF_LINE):
         return held
     model = models[0]
     images = [image for image in placed_images(model) if image.num_points3D]
@@ -173,6 +182,8 @@ def release_focal(
         return True, "level strips, as the photographs themselves show, whatever their altitudes say"
     as_held = pycolmap.Reconstruction(model)
     as_held.update_point_3d_errors()
+    if not is_flat and oblique < MIN_OBLIQUE_SHARE and focal_deviation(as_held) > TOLD_SHARE:
+        return True, OF_PARALLEL
     fit_focal(model, threads)
     best = (1 - NEARER_ON_LINE) * mean_reprojection_error(as_held)
     if is_flat and mean_reprojection_error(model) >= best:  # views that roll and pitch would tell it
@@ -236,7 +247,13 @@ def is_held_as_good(held: Sequence[pycolmap.Reconstruction], fitted: Sequence[py
 
 def fit_focal(model: pycolmap.Reconstruction, threads: int) -> None:
     """Fit the focal lengths of a model, with all else that is fitted."""
+    adjust(model, threads, hold_focal=False)
+
+
+def adjust(model: pycolmap.Reconstruction, threads: int, hold_focal: bool) -> None:
+    """Fit all of a model that is fitted, focal lengths too unless they are held, with what lenses are else."""
     options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = not hold_focal
     options.print_summary, options.ceres.solver_options.num_threads = False, threads
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     config = pycolmap.BundleAdjustmentConfig()

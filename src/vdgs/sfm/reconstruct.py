@@ -54,6 +54,7 @@ from vdgs.sfm.reconstruction_report import (
     ReconstructionResult,
     check_enough_placed,
     exclusion_reasons,
+    focal_reason,
     make_reconstruction_report,
 )
 from vdgs.sfm.sfm_estimate import SfmEstimate, estimate_sfm
@@ -201,7 +202,7 @@ def _placed_again(prepared: ReconstructionPlan, before: ReconstructionReport) ->
     """The model of a finished capture where it belongs now. Nothing is written; raises CaptureError for positions,
     distances and control points that are refused, and for a lens that these fit to none that there is."""
     model = pycolmap.Reconstruction(prepared.request.output / MAPPED)
-    found = georeference(model, prepared, before.focal_fixed)
+    found = georeference(model, prepared, (before.focal_fixed, before.focal_reason))
     _lenses(found.model)
     return found
 
@@ -234,7 +235,7 @@ def _place_anew(
         for photo in before.photographs
         if photo.excluded_reason is not None and photo.name not in known
     ]
-    held = before.focal_fixed, before.focal_reason
+    held = before.focal_fixed, focal_reason(before.focal_reason)
     seconds = time.monotonic() - began
     outcome = ReconstructionResult(
         camera_groups=kinds,
@@ -268,7 +269,7 @@ def _steps(
     )
     check_enough_placed(models[0], left_out)
     mapped = pycolmap.Reconstruction(models[0])
-    found = georeference(models[0], plan, held[0])
+    found = georeference(models[0], plan, held)
     discard_training(plan.request.output, run)
     _write(plan, workspace, mapped, found.model, keys["capture"], console)
     outcome = ReconstructionResult(

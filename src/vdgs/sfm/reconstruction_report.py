@@ -10,7 +10,14 @@ import numpy as np
 from vdgs.captures.camera_height import height_range
 from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.formats.source_capture import format_list
-from vdgs.captures.reconstruction import CameraReport, GcpReport, ImageReport, ReconstructionReport
+from vdgs.captures.reconstruction import (
+    OVER_GROUND,
+    OVER_MEDIAN,
+    CameraReport,
+    GcpReport,
+    ImageReport,
+    ReconstructionReport,
+)
 from vdgs.errors import CaptureError
 from vdgs.sfm.attitude_tilt import tilt_of_views
 from vdgs.sfm.camera_rigs import describe_rigs
@@ -41,6 +48,11 @@ from vdgs.system.lazy_pycolmap import pycolmap
 UNKNOWN = "scale, north and up are not known"
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
 MAX_FOCAL_DRIFT, MAX_HEIGHT_DRIFT = 0.05, 0.15
+#: What joins why a focal length was held and what told it afterwards.
+THEN = "; then by "
+#: Cameras follow the relief where heights over what each sees spread by less than this share of those over the median
+#: point (choice).
+FOLLOWS = 0.5
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 MAX_TILT_DEG = 3.0
 
@@ -74,16 +86,17 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     collection, positions, look = plan.image_list, plan.gps_priors, plan.preflight
     images = placed_images(model)
     metric = placed is not None
-    heights = _heights(model, images) if metric else None
+    heights, over = _flown_heights(model, images) if metric else (None, OVER_MEDIAN)
     height = None if heights is None else float(np.median(heights))
     tilt = tilt_of_views(np.array([image.cam_from_world().rotation.matrix() for image in images])) if metric else None
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, result.found.photographs) if metric else None
+    recorded = None if height is None or _relief_explains(model, images, look.height_m) else look.height_m
     untold = {kind.camera for kind in result.camera_groups if kind.model == RADIAL}
     warnings = [
         *look.warnings,
         *result.found.notes,
-        *_warnings(cameras, held, height, look.height_m, turned, tilt, untold),
+        *_warnings(cameras, held, height, recorded, turned, tilt, untold),
     ]
     if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions with altitudes
         up = placed.residuals[:, 2]
@@ -102,8 +115,9 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         altitude_reference=_altitudes(plan, result.found.control, placed) if placed and placed.is_georeferenced else "",
         origin=result.found.origin,
         residual_rms_m=_rms(placed), positions_rejected=int((~placed.inliers).sum()) if placed else 0,
-        focal_fixed=held[0], focal_reason=held[1], height_m=height,
-        heights_m=None if heights is None else height_range(heights), recorded_height_m=look.height_m, tilt_deg=tilt,
+        focal_fixed=held[0], focal_reason=focal_reason(held[1], result.found.focal_by), height_m=height,
+        heights_m=None if heights is None else height_range(heights), height_over=over, recorded_height_m=look.height_m,
+        tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
         photographs=_photographs(collection, positions, placed, result.excluded), warnings=(*warnings, *of_place),
         advice=tuple(advice),
@@ -112,6 +126,13 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         up=up_by,
         flown=first_and_last(photo.datetime for photo in collection.images),
     )  # fmt: skip
+
+
+def focal_reason(why: str, focal_by: str = "") -> str:
+    """Why a focal length is held or fitted, as a report says it, with what told it afterwards; `why` may be of a report
+    itself."""
+    before = why.split(THEN)[0]
+    return f"{before}{THEN}{focal_by}" if focal_by else before
 
 
 def _words_of_place(placed: Georegistration | AlignmentFailure) -> tuple[str, str, tuple[str, ...]]:
@@ -182,6 +203,38 @@ def _heights(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -
     """Of the cameras over the median point, [n]."""
     heights = np.array([image.projection_center()[2] for image in images])
     return heights - np.median(model_points(model)[:, 2])
+
+
+def _flown_heights(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> tuple[np.ndarray, str]:
+    """Heights of the cameras [n] and over what: over the median point, or, where a flight follows its relief, over the
+    ground that each sees."""
+    over_median = _heights(model, images)
+    over_ground = np.array([_over_seen(image, model) for image in images if image.num_points3D])
+    if not len(over_ground) or height_range(over_median) is None:
+        return over_median, OVER_MEDIAN
+    narrower = _spread(over_ground) < FOLLOWS * _spread(over_median)
+    return (over_ground, OVER_GROUND) if narrower else (over_median, OVER_MEDIAN)
+
+
+def _over_seen(image: pycolmap.Image, model: pycolmap.Reconstruction) -> float:
+    """Height of a camera over the median of the points that it shows."""
+    seen = [model.points3D[each.point3D_id].xyz[2] for each in image.points2D if each.has_point3D()]
+    return float(image.projection_center()[2] - np.median(seen))
+
+
+def _spread(heights: np.ndarray) -> float:
+    return float(np.ptp(np.quantile(heights, (0.05, 0.95))))
+
+
+def _relief_explains(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image], recorded: float | None) -> bool:
+    """Whether the take-off, by recorded heights over it, is about as high as some of the ground: then the flying height
+    over another part of it says nothing of the focal length."""
+    if recorded is None:
+        return False
+    low, high = np.quantile(model_points(model)[:, 2], (0.02, 0.98))
+    take_off = float(np.median([image.projection_center()[2] for image in images])) - recorded
+    about = MAX_HEIGHT_DRIFT * recorded
+    return bool(low - about <= take_off <= high + about)
 
 
 def cameras_of(model: pycolmap.Reconstruction, kinds: Sequence[CameraGroup]) -> tuple[CameraReport, ...]:
@@ -332,9 +385,9 @@ def _advice(look: PreflightReport, held: bool, registered: int, found: int) -> l
         )
     if held and look.oblique is not None and look.oblique == 0:
         advice.append(
-            f"add oblique views (camera {OBLIQUE_ANGLE_DEG + 10:.0f}° or more from straight down) or "
-            "a second height: walls "
-            "come out, and the focal length is fixed by the flight itself."
+            f"add oblique views (camera {OBLIQUE_ANGLE_DEG + 10:.0f}° or more from straight down): walls come out, and "
+            "the photographs tell the focal length. A second height of parallel views tells it by the recorded heights "
+            "alone, as good as these are (RTK)."
         )
     if registered < 0.9 * found:
         advice.append("see why photographs were left out: overlap, motion blur (faster shutter), water at the edges.")
