@@ -48,6 +48,7 @@ from vdgs.export.local_frame import LocalFrame
 from vdgs.export.merged_scene import SceneMerging
 from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
 from vdgs.export.programs import axes_for, with_files
+from vdgs.export.sh_degree_choice import FixedColors, choose_fixed_colors
 from vdgs.geometry.camera import Camera
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import Gaussians
@@ -221,13 +222,16 @@ def write_files(
             rows = {path: rows_within_reach(path, frame, shown.spool.means) for path, frame in frames.items()}
         _optimize(shown, baker.training, request.optimize_seconds, console)
         seconds = time.monotonic() - began
-        scene = _BakedScene(shown.spool, request.sh_degree, page, request)
-        files = [_write_fitting(path, frames[path], scene, rows[path], merging) for path in request.output]
+        scene = _BakedScene(shown.spool, request.baked_sh_degree, page, request)
+        fixed = FixedColors(baker.training, request.output[0].parent / BAKING, stack)
+        files = [
+            _write_fitting(path, frames[path], scene, rows[path], merging, fixed, whole) for path in request.output
+        ]
         losses = _measure_losses(whole, frames, scene, request, console)
     if request.background is not None:
         write_background(run, request.background)
     record: ExportDocument = to_jsonable({
-        "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.sh_degree,
+        "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.baked_sh_degree,
         "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files,
         "losses": losses,
     })  # fmt: skip
@@ -247,17 +251,40 @@ def _print_systems(systems: Mapping[Path, FileCoordinates], console: Console) ->
 
 
 def _write_fitting(
-    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging
-) -> ExportedFile:
-    """Write a file, of as many Gaussians as it has room for."""
+    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging,
+    fixed: FixedColors, run: OpenedRun,
+) -> ExportedFile:  # fmt: skip
+    """Write a file, of as many Gaussians as it has room for, in colors that it holds well."""
     notes, count = list[str](), _capacity(path, scene)
     if count < len(rows):
         notes.append(f"merged from {len(rows):,} Gaussians to {count:,}, which the file has room for")
         scene, rows = replace(scene, spool=merging.merged(count).spool), np.arange(count)
     if not registry.format_from_path(path).only_points and (note := frame.departure_note(scene.spool.means[rows])):
         notes.append(note)
+    scene, note = _with_fitting_colors(path, frame, scene, rows, fixed, run)
+    notes += [note] if note else []
     system = coordinates_of_file(path, frame, scene.request)
     return _write(path, system, scene.scene(frame, rows, path), merging.console, notes)
+
+
+def _with_fitting_colors(
+    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], fixed: FixedColors, run: OpenedRun
+) -> tuple[_BakedScene, str]:
+    """The scene with fixed colors for a file that holds no others or, where nobody asked for a degree, is no better for
+    them; and what is to be said of it."""
+    chosen = registry.format_from_path(path)
+    if not scene.degree:
+        return scene, ""
+    if not chosen.holds_changing_colors:
+        plain = replace(scene, spool=fixed.of(scene.spool), degree=0)
+        return plain, "colors are the mean of those from the directions of the training cameras"
+    if scene.request.sh_degree is not None or not (chosen.rounds_harmonics and scene.request.evaluate):
+        return scene, ""
+    plain = replace(scene, spool=fixed.of(scene.spool), degree=0)
+    is_fixed, note = choose_fixed_colors(
+        run, path, frame, lambda: scene.scene(frame, rows, path), lambda: scene.pieces(rows), lambda: plain.pieces(rows)
+    )
+    return plain if is_fixed else scene, note
 
 
 def _capacity(path: Path, scene: _BakedScene) -> int:
