@@ -16,7 +16,8 @@ import pytest
 from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.cli.main import main
+from vdgs.cli.advice import Advice
+from vdgs.cli.main import main, verb_arguments
 from vdgs.cli.result_cmds import view_command
 from vdgs.cli.start_settings import start_settings
 from vdgs.config.capture_options import CaptureOptions
@@ -26,6 +27,7 @@ from vdgs.config.method import MethodConfig, ModelConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
+from vdgs.report.status_cli import print_status, status_json
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
 from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save_run_cameras
@@ -139,6 +141,63 @@ def test_what_needs_the_capture_says_how_to_name_it(folder):
         open_run(run.path)
     relocate_capture(run, folder / "place")
     assert open_run(run.path).capture.root == folder / "place"
+
+
+@pytest.fixture
+def moved_run(folder, tmp_path) -> RunFolder:
+    """A run that made its capture in its own folder, which was moved since."""
+    run = RunFolder(folder / "run")
+    (folder / "place").rename(run.own_capture)
+    for place in (run.path, run.own_capture):
+        (place / "reconstruction.json").write_text('{"made": "here"}')
+    text = run.config_file.read_text()
+    run.config_file.write_text(text.replace(str(tmp_path / "gone" / "place"), str(tmp_path / "gone" / "capture")))
+    return run
+
+
+def test_a_capture_in_the_folder_of_its_run_moves_with_it(moved_run, tmp_path):
+    keys, before = moved_run.keys(), moved_run.config_file.read_text()
+    assert moved_run.settings().capture_path == str(moved_run.own_capture)
+    assert open_run(moved_run.path).capture.root == moved_run.own_capture
+    assert moved_run.coarse.is_done(keys.coarse)  # nothing is trained anew for it
+    assert moved_run.config_file.read_text() == before
+    (tmp_path / "gone").mkdir()
+    shutil.copytree(moved_run.own_capture, tmp_path / "gone" / "capture")  # as of a run that was copied
+    assert open_run(moved_run.path).capture.root == moved_run.own_capture
+    moved_run.change_settings(moved_run.settings(), overwrite=False)
+    assert f"path: {moved_run.own_capture}\n" in moved_run.config_file.read_text()  # what continues it writes it down
+
+
+@pytest.mark.parametrize("other", ["another reconstruction", "none", "another name"])
+def test_another_capture_in_the_folder_of_a_run_is_not_taken_for_its_own(moved_run, other, tmp_path):
+    if other == "another name":  # the run is of a capture elsewhere
+        text = moved_run.config_file.read_text()
+        moved_run.config_file.write_text(text.replace(str(tmp_path / "gone" / "capture"), str(tmp_path / "flight")))
+    elif other == "none":
+        (moved_run.own_capture / "reconstruction.json").unlink()
+    else:
+        (moved_run.own_capture / "reconstruction.json").write_text('{"made": "anew"}')
+    with pytest.raises(CaptureError, match=r"/(gone/capture|flight): the capture of .* is not there"):
+        open_run(moved_run.path)
+
+
+@pytest.mark.parametrize(("verb", "advised"), [("export", "export"), ("eval", "eval"), ("status", "visibility")])
+def test_a_missing_capture_is_named_by_the_verb_that_was_typed(folder, verb, advised, tmp_path):
+    run = folder / "run"
+    text = RunFolder(run).missing_capture()
+    assert text.startswith(f"{tmp_path}/gone/place: the capture of {run} is not there.")
+    assert Advice(verb, verb_arguments).fit(text).endswith(f"say where to, once: vdgs {advised} {run} --capture PATH")
+
+
+def test_the_status_says_that_the_capture_is_missing(folder, capsys):
+    run = RunFolder(folder / "run")
+    text = run.missing_capture()
+    print_status(run, Console(soft_wrap=True))
+    assert f"to mend: {text}" in capsys.readouterr().out
+    assert status_json(run)["problem"] == text
+    assert status_json(run)["next_command"] is None
+    relocate_capture(run, folder / "place")
+    assert status_json(run)["problem"] is None
 
 
 def test_another_capture_is_not_remembered(folder, tmp_path):
