@@ -19,6 +19,7 @@ from torch import Tensor
 
 from vdgs.captures.first_view import default_view
 from vdgs.captures.output_guard import check_no_link, check_not_among_inputs, check_output
+from vdgs.captures.reconstruction import place_name
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
@@ -54,7 +55,7 @@ from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
-from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.system.atomic_files import read_json_or_empty, to_jsonable, write_json
 from vdgs.system.console import make_progress_bar, print_warning
 from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
 from vdgs.system.scratch import check_takes_files, remove_leftovers
@@ -103,7 +104,8 @@ def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
     """The first view (`default_view`), before the color that the model has behind it; ground frame."""
     position, target = default_view(run.capture)
     red, green, blue = (float(each) for each in run.model.background)
-    title = run.capture.root.resolve().name or "scene"
+    recorded = read_json_or_empty(run.folder.place_file).get("name")  # as the report is headed
+    title = str(recorded or place_name(run.capture.root) or "scene")
     cameras = [view.camera for view in run.capture.train_views]
     return InitialView(
         _point(position), _point(target), (red, green, blue), title, most_bytes,

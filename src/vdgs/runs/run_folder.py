@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from vdgs.captures.reconstruction import RECONSTRUCTION_FILE, is_reconstruction
+from vdgs.captures.reconstruction import OWN_CAPTURE, RECONSTRUCTION_FILE, is_reconstruction
 from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.block_records import PartitionRecord
@@ -41,7 +41,7 @@ class RunFolder:
     @property
     def own_capture(self) -> Path:
         """The capture that a run of photographs alone makes of them."""
-        return self.path / "capture"
+        return self.path / OWN_CAPTURE
 
     @property
     def config_file(self) -> Path:
