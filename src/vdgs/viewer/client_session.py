@@ -60,7 +60,7 @@ class ClientSession:
         height = scene.camera_height
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
         self._on_camera_moved()
-        self._step_back_if_narrow()
+        self._fit_first_view()
 
     @property
     def camera(self) -> Camera | None:
@@ -149,14 +149,19 @@ class ClientSession:
                 self._hide_image_if_left(camera)
             self.scheduler.request_frame(self._render_session, camera, self._display)
 
-    def _step_back_if_narrow(self) -> None:
-        """All browsers begin where a window at least as wide as high shows all: a narrower one must stand farther
-        away. Where an address names another first view, that stays."""
-        if self._camera is None or self._camera.width >= self._camera.height:
+    def _fit_first_view(self) -> None:
+        """All browsers begin where a wide window shows all: in one that is higher than wide, or where the panel would
+        cover a part, one must stand farther away or aside. Where an address names another first view, that stays."""
+        if self._camera is None or navigation.fit_beside_panel(*self._canvas) == (1.0, 0.0):
             return
         begin = navigation.overview_pose(self.scene.capture)
         if np.allclose(self.pose.position, begin.position, atol=1e-3 * begin.distance):
-            self.move_to(navigation.overview_pose(self.scene.capture, self._camera.width / self._camera.height))
+            self.move_to(navigation.overview_pose(self.scene.capture, self._canvas))
+
+    @property
+    def _canvas(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return int(self.client.camera.image_width), int(self.client.camera.image_height)
 
     def _hide_image_if_left(self, camera: Camera) -> None:
         index = self._display.image_index
@@ -258,7 +263,7 @@ class ClientSession:
         @buttons.on_click
         def _(_: Any) -> None:
             poses: dict[str, Callable[[], CameraPose]] = {
-                "All": lambda: navigation.overview_pose(self.scene.capture, self.client.camera.aspect, whole=True),
+                "All": lambda: navigation.overview_pose(self.scene.capture, self._canvas, whole=True),
                 "From above": lambda: navigation.top_down_pose(self.pose),
                 "North up": lambda: navigation.north_up_pose(self.pose),
             }

@@ -171,8 +171,8 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
 
 
 def _set_initial_camera(server: Any, run: OpenedRun) -> None:
-    """Where viser lets every new connection stand, in a window at least as wide as high. A session moves on from there:
-    in a narrower window, and where its browser stood before (`Visits.welcome`)."""
+    """Where viser lets every new connection stand, in a wide window. A session moves on from there: in a narrower
+    window, and where its browser stood before (`Visits.welcome`)."""
     stand, height = navigation.overview_pose(run.capture), camera_height(run.capture)
     start = server.initial_camera
     start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
