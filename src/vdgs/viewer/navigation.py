@@ -80,11 +80,14 @@ def _rotation_matrix(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
 def overview_pose(capture: Capture, canvas: tuple[int, int] | None = None, whole: bool = False) -> CameraPose:
     """The first view, on a canvas of this width and height in pixels (None: one that hides nothing): all of the flight,
     or unless the `whole` is asked for, what the photographs look at (`default_view`)."""
-    position, target = default_view(capture, whole)
-    if canvas is None:
-        return CameraPose(position, target)
+    pose = CameraPose(*default_view(capture, whole))
+    return pose if canvas is None else fitted_pose(pose, canvas)
+
+
+def fitted_pose(pose: CameraPose, canvas: tuple[int, int]) -> CameraPose:
+    """A first view on a canvas of this width and height (`fit_beside_panel`)."""
     farther, aside = fit_beside_panel(*canvas)
-    away = farther * (position - target)
+    target, away = pose.look_at, farther * (pose.position - pose.look_at)
     right = np.cross((0.0, 0.0, 1.0), away)
     right *= aside * 2 * math.tan(math.radians(FOV_DEG / 2)) * np.linalg.norm(away) / np.linalg.norm(right)
     return CameraPose(target + away + right, target + right)

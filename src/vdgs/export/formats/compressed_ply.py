@@ -154,8 +154,8 @@ class _HarmonicRounding:
     """
 
     def __init__(self, coefficients: int) -> None:
-        # Each begins at another place within a step, so that not all are rounded the same way at the same Gaussian.
-        self._over = np.random.default_rng(0).random(coefficients)
+        # Each begins at another place within a step, in no order, so that at any Gaussian about half are rounded up.
+        self._over = (np.random.default_rng(0).permutation(coefficients) + 0.5) / max(coefficients, 1)
 
     def to_bytes(self, piece: Gaussians) -> UInt8[np.ndarray, "n c"]:
         """The bytes of the next Gaussians of the file."""
