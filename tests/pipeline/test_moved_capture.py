@@ -25,6 +25,8 @@ from vdgs.config.commands import RenderRequest
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import MethodConfig, ModelConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.export.export_run import make_initial_view
+from vdgs.pipeline.finished_run import same_photographs
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
 from vdgs.report.status_cli import print_status, status_json
@@ -34,6 +36,7 @@ from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.visibility_store import get_run_visibility
+from vdgs.sfm.source_images import SourceImages
 from vdgs.system.quoting import shell_line
 
 pytestmark = [pytest.mark.xdist_group("moved_capture"), pytest.mark.slow]
@@ -408,3 +411,26 @@ def test_a_capture_that_moved_is_named_to_view_too(folder, monkeypatch):
     view_command([str(folder / "run"), "--capture", str(folder / "place")])
     assert [each.capture.root for each in shown] == [folder / "place"]
     assert RunFolder(folder / "run").settings().capture_path == str(folder / "place")
+
+
+def test_a_run_of_photographs_is_known_by_these_whatever_else_the_command_says(moved_run):
+    """A finished run that was moved, or that is asked for without the options of its method, which it has."""
+    moved_run.move_capture(moved_run.own_capture)
+    begun = "vdgs run /photos/a --output /before/run --preset laptop --sfm.matching exhaustive --gps /photos/g.csv"
+    SourceImages(folders=("/photos/a",), files=(), command=begun).write(moved_run.own_capture)
+    same = "vdgs run /photos/a --gps /photos/g.csv --sfm.matching exhaustive --output /now/run --iterations 40"
+    others = (
+        same.replace("/photos/a", "/photos/b"), same.replace("exhaustive", "sequential"),
+        same.replace("--gps /photos/g.csv ", ""), f"{same} --extra-image-folders /photos/b",
+        same.replace("/photos/a", "/photos/a /photos/b"),
+    )  # fmt: skip
+    assert same_photographs(moved_run, same)
+    assert [same_photographs(moved_run, other) for other in others] == [False] * len(others)
+
+
+def test_a_page_is_named_as_the_report(moved_run):
+    shown = open_run(moved_run.path)
+    moved_run.place_file.unlink(missing_ok=True)
+    assert make_initial_view(shown, 1).title == moved_run.path.name == "run"  # not as its folder, `capture`
+    moved_run.place_file.write_text('{"name": "valley"}')
+    assert make_initial_view(shown, 1).title == "valley"

@@ -53,7 +53,7 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     """Whether the run has the settings that are asked for, and is of this capture or of these photographs."""
     own = run.settings()
     if request.capture.resolve() != Path(own.capture_path):
-        if run.config.command() != command and not _same_photographs(run, command):
+        if run.config.command() != command and not same_photographs(run, command):
             return False
         gps, scale_bar = own.capture.gps, own.capture.scale_bar  # used by the reconstruction of the photographs alone
         request = replace(request, options=replace(request.options, gps=gps, scale_bar=scale_bar))
@@ -63,7 +63,7 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     return method == own.method and with_absolute_paths(request.options, request.capture) == own.capture
 
 
-def _same_photographs(run: RunFolder, command: str) -> bool:
+def same_photographs(run: RunFolder, command: str) -> bool:
     """Whether a command names the photographs that the run made its capture of, with the options that it was made with:
     other words about the method, or another place of the run, do not count."""
     made = SourceImages.read(run.own_capture)
