@@ -205,6 +205,24 @@ def test_a_file_that_nobody_takes_for_a_photograph_may_lie_among_some(tmp_path: 
     assert is_refused(tmp_path / "DCIM" / "100MEDIA" / "scene.html")
 
 
+def test_pictures_that_only_lie_there_keep_no_file_away(tmp_path: Path) -> None:
+    """Figures, or pictures of a screen among other work: no series that is most of what lies there."""
+    figures = tmp_path / "figures"
+    figures.mkdir()
+    for name in ("plan", "report", "town-north", "town-south", "overview", "IMG_20240102"):
+        shutil.copy(photographs(tmp_path / "some", 1) / "P0000.jpg", figures / f"{name}.jpg")
+    work = photographs(tmp_path / "work", 5)
+    for name in "abcdefg":
+        (work / f"{name}.txt").touch()
+    for folder in (figures, work):
+        for name in ("film.mp4", "sky.png", "map.tif"):
+            assert not is_refused(folder / name), name
+        assert is_refused(folder)  # many files would be mixed with them
+    frames = photographs(tmp_path / "frames", 5)  # of a film, without what a camera says
+    (frames / "notes.txt").touch()
+    assert is_refused(frames / "film.mp4")
+
+
 @pytest.mark.parametrize("poses", ["transforms.json", "poses_bounds.npy"])
 def test_points_beside_the_photographs_in_a_root_would_be_those_of_the_capture(tmp_path: Path, poses: str) -> None:
     root = photographs(tmp_path / "set", 3)

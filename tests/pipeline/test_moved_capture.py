@@ -16,7 +16,8 @@ import pytest
 from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.cli.main import main
+from vdgs.cli.advice import Advice
+from vdgs.cli.main import main, verb_arguments
 from vdgs.cli.result_cmds import view_command
 from vdgs.cli.start_settings import start_settings
 from vdgs.config.capture_options import CaptureOptions
@@ -24,14 +25,18 @@ from vdgs.config.commands import RenderRequest
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import MethodConfig, ModelConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.export.export_run import make_initial_view
+from vdgs.pipeline.finished_run import same_photographs
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.rendering.render_run import render_run
+from vdgs.report.status_cli import print_status, status_json
 from vdgs.runs.create_or_resume import create_or_resume_run
 from vdgs.runs.open_run import open_capture, open_model, open_run, relocate_capture
 from vdgs.runs.run_cameras import load_run_cameras, run_cameras_of_capture, save_run_cameras
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.visibility_store import get_run_visibility
+from vdgs.sfm.source_images import SourceImages
 from vdgs.system.quoting import shell_line
 
 pytestmark = [pytest.mark.xdist_group("moved_capture"), pytest.mark.slow]
@@ -139,6 +144,63 @@ def test_what_needs_the_capture_says_how_to_name_it(folder):
         open_run(run.path)
     relocate_capture(run, folder / "place")
     assert open_run(run.path).capture.root == folder / "place"
+
+
+@pytest.fixture
+def moved_run(folder, tmp_path) -> RunFolder:
+    """A run that made its capture in its own folder, which was moved since."""
+    run = RunFolder(folder / "run")
+    (folder / "place").rename(run.own_capture)
+    for place in (run.path, run.own_capture):
+        (place / "reconstruction.json").write_text('{"made": "here"}')
+    text = run.config_file.read_text()
+    run.config_file.write_text(text.replace(str(tmp_path / "gone" / "place"), str(tmp_path / "gone" / "capture")))
+    return run
+
+
+def test_a_capture_in_the_folder_of_its_run_moves_with_it(moved_run, tmp_path):
+    keys, before = moved_run.keys(), moved_run.config_file.read_text()
+    assert moved_run.settings().capture_path == str(moved_run.own_capture)
+    assert open_run(moved_run.path).capture.root == moved_run.own_capture
+    assert moved_run.coarse.is_done(keys.coarse)  # nothing is trained anew for it
+    assert moved_run.config_file.read_text() == before
+    (tmp_path / "gone").mkdir()
+    shutil.copytree(moved_run.own_capture, tmp_path / "gone" / "capture")  # as of a run that was copied
+    assert open_run(moved_run.path).capture.root == moved_run.own_capture
+    moved_run.change_settings(moved_run.settings(), overwrite=False)
+    assert f"path: {moved_run.own_capture}\n" in moved_run.config_file.read_text()  # what continues it writes it down
+
+
+@pytest.mark.parametrize("other", ["another reconstruction", "none", "another name"])
+def test_another_capture_in_the_folder_of_a_run_is_not_taken_for_its_own(moved_run, other, tmp_path):
+    if other == "another name":  # the run is of a capture elsewhere
+        text = moved_run.config_file.read_text()
+        moved_run.config_file.write_text(text.replace(str(tmp_path / "gone" / "capture"), str(tmp_path / "flight")))
+    elif other == "none":
+        (moved_run.own_capture / "reconstruction.json").unlink()
+    else:
+        (moved_run.own_capture / "reconstruction.json").write_text('{"made": "anew"}')
+    with pytest.raises(CaptureError, match=r"/(gone/capture|flight): the capture of .* is not there"):
+        open_run(moved_run.path)
+
+
+@pytest.mark.parametrize(("verb", "advised"), [("export", "export"), ("eval", "eval"), ("status", "visibility")])
+def test_a_missing_capture_is_named_by_the_verb_that_was_typed(folder, verb, advised, tmp_path):
+    run = folder / "run"
+    text = RunFolder(run).missing_capture()
+    assert text.startswith(f"{tmp_path}/gone/place: the capture of {run} is not there.")
+    assert Advice(verb, verb_arguments).fit(text).endswith(f"say where to, once: vdgs {advised} {run} --capture PATH")
+
+
+def test_the_status_says_that_the_capture_is_missing(folder, capsys):
+    run = RunFolder(folder / "run")
+    text = run.missing_capture()
+    print_status(run, Console(soft_wrap=True))
+    assert f"to mend: {text}" in capsys.readouterr().out
+    assert status_json(run)["problem"] == text
+    assert status_json(run)["next_command"] is None
+    relocate_capture(run, folder / "place")
+    assert status_json(run)["problem"] is None
 
 
 def test_another_capture_is_not_remembered(folder, tmp_path):
@@ -349,3 +411,26 @@ def test_a_capture_that_moved_is_named_to_view_too(folder, monkeypatch):
     view_command([str(folder / "run"), "--capture", str(folder / "place")])
     assert [each.capture.root for each in shown] == [folder / "place"]
     assert RunFolder(folder / "run").settings().capture_path == str(folder / "place")
+
+
+def test_a_run_of_photographs_is_known_by_these_whatever_else_the_command_says(moved_run):
+    """A finished run that was moved, or that is asked for without the options of its method, which it has."""
+    moved_run.move_capture(moved_run.own_capture)
+    begun = "vdgs run /photos/a --output /before/run --preset laptop --sfm.matching exhaustive --gps /photos/g.csv"
+    SourceImages(folders=("/photos/a",), files=(), command=begun).write(moved_run.own_capture)
+    same = "vdgs run /photos/a --gps /photos/g.csv --sfm.matching exhaustive --output /now/run --iterations 40"
+    others = (
+        same.replace("/photos/a", "/photos/b"), same.replace("exhaustive", "sequential"),
+        same.replace("--gps /photos/g.csv ", ""), f"{same} --extra-image-folders /photos/b",
+        same.replace("/photos/a", "/photos/a /photos/b"),
+    )  # fmt: skip
+    assert same_photographs(moved_run, same)
+    assert [same_photographs(moved_run, other) for other in others] == [False] * len(others)
+
+
+def test_a_page_is_named_as_the_report(moved_run):
+    shown = open_run(moved_run.path)
+    moved_run.place_file.unlink(missing_ok=True)
+    assert make_initial_view(shown, 1).title == moved_run.path.name == "run"  # not as its folder, `capture`
+    moved_run.place_file.write_text('{"name": "valley"}')
+    assert make_initial_view(shown, 1).title == "valley"

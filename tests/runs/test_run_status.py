@@ -66,7 +66,8 @@ def measured(folder: Path, model: str, psnr: float, name: str) -> None:
 def run(tmp_path) -> RunFolder:
     """A whole run of two blocks, by hand, with its report."""
     run = RunFolder(tmp_path / "run")
-    run.create_or_check(RunSettings.create("/nowhere", CaptureOptions(), MethodConfig()), command=COMMAND)
+    (tmp_path / "place").mkdir()
+    run.create_or_check(RunSettings.create(tmp_path / "place", CaptureOptions(), MethodConfig()), command=COMMAND)
     coarse = trained(run.coarse, run.keys().coarse, 0)
     measured(run.coarse.path / "evaluation", coarse, 21.25, "coarse")
     keys = run.keys()

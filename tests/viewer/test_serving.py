@@ -258,11 +258,35 @@ def test_measures_are_drawn_where_they_are(viewer, guest):
     assert not lines & placed
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "farther"),
+    [(1920, 1000, 1.0), (1400, 800, 1.0), (1100, 750, 1.18), (2200, 1500, 1.18), (800, 600, 1.55), (400, 800, 2.0),
+     (480, 320, 1.0)],
+)  # fmt: skip
+def test_the_first_view_lies_beside_the_panel(viewer, width: int, height: int, farther: float) -> None:
+    capture = viewer.scene.capture
+    wide, pose = navigation.overview_pose(capture), navigation.overview_pose(capture, (width, height))
+    assert pose.distance == pytest.approx(farther * wide.distance, rel=0.01)
+    focal = 0.5 * height / math.tan(math.radians(25))
+    camera = Camera(
+        camera_from_world=look_at_pose(pose.position, pose.look_at), fx=focal, fy=focal, cx=width / 2, cy=height / 2,
+        width=width, height=height,
+    )  # fmt: skip
+    across = camera.camera_from_world @ np.append(wide.look_at, 1.0)
+    middle, half = width / 2 + focal * across[0] / across[2], 0.6 * height / farther
+    is_phone = width <= 576  # its panel is below
+    panel = 0 if is_phone else 335 * (2 if width > 2000 else 1)
+    assert 0 <= middle <= width / 2 + 1e-6
+    if not is_phone:
+        assert middle + half <= width - panel + 2
+        assert middle - half >= -2
+
+
 @quiet
 def test_a_narrow_window_shows_all_at_first(viewer):
     wait_until(lambda: not viewer.sessions)
     capture = viewer.scene.capture
-    for width, height in ((480, 320), (240, 480)):
+    for width, height in ((480, 320), (240, 480), (1100, 750)):
         begin = navigation.overview_pose(capture)
         focal = 0.5 * height / math.tan(math.radians(25))
         camera = Camera(
@@ -272,7 +296,7 @@ def test_a_narrow_window_shows_all_at_first(viewer):
         guest = Guest(viewer.access.local_url())
         guest.stand(camera)
         visitor = newest(viewer)
-        meant = navigation.overview_pose(capture, width / height)
+        meant = navigation.overview_pose(capture, (width, height))
         wait_until(lambda visitor=visitor, meant=meant: np.allclose(visitor.pose.position, meant.position))
         guest.close()
         wait_until(lambda: not viewer.sessions)

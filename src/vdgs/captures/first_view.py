@@ -18,7 +18,7 @@ from vdgs.geometry.view_convergence import Convergence, find_convergence
 #: Vertical angle of view of a first look (choice).
 FOV_DEG = 50.0
 #: The scene, without this share of its points on every side, fills this share of the picture's height, and as many
-#: pixels across: a panel fits beside the scene.
+#: pixels across: a panel fits beside the scene in a wide window.
 _TRIM_QUANTILE, _FILLED_SHARE = 0.003, 0.8
 #: Points by which the scene is found, points and cameras by which directions are compared.
 _MAX_SCENE_POINTS, _MAX_POINTS, _MAX_CAMERAS = 5000, 300, 60

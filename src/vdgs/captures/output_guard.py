@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -131,8 +132,9 @@ def _is_written_into(folder: Path, output: Path) -> bool:
 def _holds_photographs(folder: Path, output: Path) -> bool:
     """Whether an output in a folder would lie among photographs.
 
-    Where it is written right into the folder, or is the folder, few photographs are enough; further up most of what is
-    there must be photographs: a home folder with some pictures is no folder of photographs.
+    Where it is the folder, few pictures are enough. A file in the folder is refused for one of a camera, and for a
+    numbered series that is most of what is there; further up most of what is there must be pictures. Neither a home
+    folder with some pictures nor one of screenshots is a folder of photographs.
     """
     try:
         names = {entry.name: entry.is_file() for entry in os.scandir(folder) if not entry.name.startswith(".")}
@@ -145,9 +147,18 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
     suffixes = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
     pictures = [folder / name for name, is_file in names.items() if is_file and Path(name).suffix.lower() in suffixes]
     pictures = [picture for picture in _without_undistorted(pictures, names) if not is_result(picture)]
-    if _is_written_into(folder, output):
+    if output == folder:
         return len(pictures) >= _MANY_PICTURES or any(map(has_camera, pictures))
+    if _is_written_into(folder, output):
+        return _series_length(pictures) >= max(_MANY_PICTURES, len(names) / 2) or any(map(has_camera, pictures))
     return len(pictures) >= max(_MANY_PICTURES, len(names) / 2)
+
+
+def _series_length(pictures: Sequence[Path]) -> int:
+    """How many pictures belong to a series, as a camera or a film leaves it: three or more of one ending whose names
+    differ by their numbers."""
+    series = Counter((re.sub(r"\d+", "0", picture.stem), picture.suffix.lower()) for picture in pictures)
+    return sum(count for count in series.values() if count >= _MANY_PICTURES)
 
 
 def _without_undistorted(pictures: list[Path], names: Collection[str]) -> list[Path]:

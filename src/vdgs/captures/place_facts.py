@@ -16,7 +16,7 @@ from vdgs.captures.camera_height import camera_height, height_range, view_distan
 from vdgs.captures.capture import Capture, spread_evenly
 from vdgs.captures.capture_dates import date_taken, first_and_last
 from vdgs.captures.place_record import ON_CONVERGENCE, ON_GROUND, ON_SHOWN, Bounds, PlaceFacts
-from vdgs.captures.reconstruction import read_reconstruction
+from vdgs.captures.reconstruction import place_name, read_reconstruction
 from vdgs.captures.scene_points import MIN_SEEN_BY, ground_sampling_distance, scene_points
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu, wrap_degrees
@@ -34,8 +34,6 @@ _POINTS_BELOW = 15
 _LEVEL_TILT_DEG = 60.0
 #: Photographs that are asked for their date.
 _MAX_DATED = 60
-#: The name of the capture in a run of photographs alone, for which the name of the run is shown.
-OWN_CAPTURE = "capture"
 
 
 def measure_place(capture: Capture) -> PlaceFacts:
@@ -69,7 +67,7 @@ def measure_place(capture: Capture) -> PlaceFacts:
     used, root = len(capture.views), capture.root.resolve()
     pixel, pixel_shows = _pixel(capture)
     return PlaceFacts(
-        name=root.parent.name if reconstruction and root.name == OWN_CAPTURE else root.name,
+        name=place_name(root),
         unit=ground.unit, photographs_used=used, photographs_test=len(capture.test_views),
         photographs_found=max(used, reconstruction.found if reconstruction else used + capture.num_unused_images),
         flown=flown, ground_sampling_distance=pixel, pixel_shows=pixel_shows, image_folder=capture.images,

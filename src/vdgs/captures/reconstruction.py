@@ -24,6 +24,8 @@ STEPS_FILE = "steps.json"
 ANEW = "anew"
 #: How far the present step is, in the work folder.
 PROGRESS_FILE = "progress.json"
+#: The name of the capture in a run of photographs alone.
+OWN_CAPTURE = "capture"
 #: The photographs that it is made of, in the capture.
 SOURCE_IMAGES_FILE = "photographs.json"
 #: The digests of what they hold, so that files are read again only where they may have changed.
@@ -184,6 +186,13 @@ def _is_ours(file: Path) -> bool:
         return False
     with file.open("rb") as stream:
         return not stream.read(64).lstrip().startswith(b"[")
+
+
+def place_name(root: Path) -> str:
+    """What the place that a capture shows is called where people read it: as its folder, or, of a capture that a run
+    made of photographs, as the run."""
+    folder = root.resolve()
+    return folder.parent.name if folder.name == OWN_CAPTURE and is_reconstruction(folder) else folder.name
 
 
 def is_finished(root: Path) -> bool:

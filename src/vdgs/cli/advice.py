@@ -14,6 +14,8 @@ from vdgs.config.options import options_of
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9]*(?:[.-][a-z0-9]+)*(?:\.\*)?")
 #: A command in a text, up to the end of its sentence or of its quotation.
 COMMAND = re.compile(r"vdgs ([a-z][a-z-]*)\b(?:(?!\. |[`;:\n]|, or ).)*")
+#: The command that tells a run where its capture lies now (`RunFolder.missing_capture`), with the run.
+CAPTURE_COMMAND = re.compile(r"vdgs visibility (.+?) --capture PATH")
 #: How the verb that runs changes its messages (`Advice.fit`).
 MESSAGE_FIT: ContextVar[Callable[[str], str]] = ContextVar("MESSAGE_FIT", default=str)
 
@@ -37,10 +39,13 @@ class Advice:
 
     def fit(self, text: str) -> str:
         """A message that names no option as the verb's own which it lacks: one that the verb has in a group is named by
-        it (`--sfm.focal` in `vdgs run`), and of others it says which verbs have them."""
+        it (`--sfm.focal` in `vdgs run`), and of others it says which verbs have them. Where the capture of a run lies,
+        the verb itself takes if it can."""
         if "--" not in text:
             return text
         own = flags_of(self.kinds()[self.verb])
+        if "--capture" in own:
+            text = CAPTURE_COMMAND.sub(rf"vdgs {self.verb} \1 --capture PATH", text)
         commands = [each.span() for each in COMMAND.finditer(text) if each.group(1) in self.kinds()]
         foreign: dict[str, str] = {}
 

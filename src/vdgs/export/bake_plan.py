@@ -107,7 +107,7 @@ class BakePlan:
 
 def drop_unused_sh_degrees(request: ExportRequest) -> ExportRequest:
     """Without colors that change with the direction where no file that is asked for holds them."""
-    if all(registry.format_from_path(path).fixed_colors for path in request.output):
+    if not any(registry.format_from_path(path).holds_changing_colors for path in request.output):
         return replace(request, sh_degree=0)
     return request
 
@@ -148,7 +148,7 @@ def _depends_on(run: OpenedRun, request: ExportRequest) -> list[Any]:
         run.name,
         run.key,
         run.status.model_id,
-        request.sh_degree,
+        request.baked_sh_degree,
         count,
         request.block,
         box,

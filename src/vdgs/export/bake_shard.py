@@ -55,7 +55,7 @@ def _doing(run: OpenedRun, asked: ExportRequest, work: BakePlan, step: BakeStep)
     kept = load_array(work.selection_file, np.int64, 1)
     if step.kind is FIT:
         return _fitting(run, asked, work, kept)
-    baked = BakedGaussians(run.model, kept, open_store(work.store_file(step.round - 1), asked.sh_degree))
+    baked = BakedGaussians(run.model, kept, open_store(work.store_file(step.round - 1), asked.baked_sh_degree))
     return _comparing(work, step, baked) if step.kind is COMPARE else _mending(work, step, baked)
 
 
@@ -69,11 +69,11 @@ def _surveying(run: OpenedRun, work: BakePlan) -> ItemWriter:
 
 def _fitting(run: OpenedRun, request: ExportRequest, work: BakePlan, kept: np.ndarray) -> ItemWriter:
     seen = BakeViews(run.model, work.training, [load_contributions(file) for file in work.files(work.step(SURVEY))])
-    empty = np.zeros((0, 14 + 3 * (num_sh_bases(request.sh_degree) - 1)), np.float32)
+    empty = np.zeros((0, 14 + 3 * (num_sh_bases(request.baked_sh_degree) - 1)), np.float32)
 
     def do(place: int) -> Callable[[Path], None]:
         wanted = np.ascontiguousarray(gaussians_of_part(kept, run.model, place))
-        rows = flatten(fit_gaussians(seen, wanted, request.sh_degree)) if len(wanted) else empty
+        rows = flatten(fit_gaussians(seen, wanted, request.baked_sh_degree)) if len(wanted) else empty
         return lambda path: write_array(path, rows)
 
     return do

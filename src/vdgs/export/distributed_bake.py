@@ -105,7 +105,7 @@ class DistributedBake:
         file = work.store_file(self._last)
         if self._asked.optimize_seconds > 0:  # which changes it: what shards came to stays as it is
             file = Path(shutil.copyfile(file, file.with_name("refined.spool")))
-        spool = open_store(file, self._asked.sh_degree, writable=self._asked.optimize_seconds > 0)
+        spool = open_store(file, self._asked.baked_sh_degree, writable=self._asked.optimize_seconds > 0)
         yield replace(spool, means=np.array(spool.means))
 
     def _gather(self, number: int, count: int) -> None:
@@ -113,10 +113,10 @@ class DistributedBake:
 
         def write(file: Path) -> None:
             if number == 0:
-                write_store(ExportScene(chunks=self._parts(), count=count, degree=self._asked.sh_degree), file)
+                write_store(ExportScene(chunks=self._parts(), count=count, degree=self._asked.baked_sh_degree), file)
                 return
             shutil.copyfile(self._work.store_file(number - 1), file)
-            spool = open_store(file, self._asked.sh_degree, writable=True)
+            spool = open_store(file, self._asked.baked_sh_degree, writable=True)
             for part in self._work.files(self._work.step(UPDATE_COLORS, number)):
                 check_stop_requested()
                 spool.add_sh(*load_color_updates(part))
@@ -128,7 +128,7 @@ class DistributedBake:
             check_stop_requested()
             rows = load_array(file, np.float32, 2)
             if len(rows):
-                yield unflatten(torch.from_numpy(rows), self._asked.sh_degree)
+                yield unflatten(torch.from_numpy(rows), self._asked.baked_sh_degree)
 
     def _tidy(self, number: int) -> None:
         """Remove what is used up once the Gaussians of a round are there."""

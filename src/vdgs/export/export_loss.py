@@ -15,9 +15,10 @@ from vdgs.evaluation.by_visibility import VisibilityBin, VisibilityHistogram
 from vdgs.evaluation.color_correction import correct_colors
 from vdgs.evaluation.evaluate_run import cached_reference_views, make_visibility_map, with_coarse_model
 from vdgs.evaluation.metrics import masked_mean, psnr_from_mse, squared_error, ssim_map, to_8bit
-from vdgs.evaluation.view_exposures import apply_exposure_numpy, make_exposures
+from vdgs.evaluation.view_exposures import ViewExposures, apply_exposure_numpy, make_exposures
 from vdgs.export.formats.export_scene import concatenate
 from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
 from vdgs.model.gaussians import Gaussians, render_gaussians, visible_gaussian_rows
 from vdgs.model.renderer import render
 from vdgs.runs.open_run import OpenedRun
@@ -61,8 +62,8 @@ def measure_loss(
     as `vdgs eval` compares in the exposure of each view, or in neutral colors where these are of the local exposure
     (`AnchorModel.local_exposure`). Of the pieces only what those views show is kept in memory."""
     views = views_to_measure(run)
-    exposure = make_exposures(run.model, run.capture) if run.model.local_exposure is None else None
-    gaussians = _seen(chunks, [view.camera for view in views])
+    exposure = file_exposure(run)
+    gaussians = seen_gaussians(chunks, [view.camera for view in views])
     visibility = make_visibility_map(with_coarse_model(run))
     names = [f"{figure}{whose}" for figure in ("squared_error", "ssim") for whose in ("", "_baked")]
     histogram, rows = VisibilityHistogram(names), list[list[float]]()
@@ -71,7 +72,7 @@ def measure_loss(
             reference, mask = photographs.load_image(view), photographs.load_mask(view)
             # Over the plain color: files have no environment map.
             own = render(run.model, view.camera, background=run.model.background).image.cpu().numpy()
-            neutral = own, _render_gaussians(gaussians, run, view.camera)
+            neutral = own, render_file(gaussians, run, view.camera).image.numpy()
             exposed = neutral if exposure is None else [apply_exposure_numpy(each, exposure(view)) for each in neutral]
             drawn = [to_8bit(each) for each in exposed]
             corrected = [to_8bit(correct_colors(picture, reference, mask).image) for picture in drawn]
@@ -91,7 +92,7 @@ def measure_loss(
     )  # fmt: skip
 
 
-def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
+def seen_gaussians(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
     """What the cameras may show of the pieces, and at least one Gaussian."""
     kept: list[Gaussians] = []
     for piece in pieces:
@@ -103,10 +104,15 @@ def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
     return concatenate(kept)
 
 
+def file_exposure(run: OpenedRun) -> ViewExposures | None:
+    """The exposures that files, which hold neutral colors, are drawn in to be compared with photographs; None where
+    neutral colors are those of the local exposure."""
+    return make_exposures(run.model, run.capture) if run.model.local_exposure is None else None
+
+
 @torch.no_grad()
-def _render_gaussians(gaussians: Gaussians, run: OpenedRun, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+def render_file(gaussians: Gaussians, run: OpenedRun, camera: Camera) -> Raster:
+    """What a file shows, on the CPU, over the plain color of its run."""
     background: Float[Tensor, "3"] = torch.tensor(run.model.background, dtype=torch.float32, device="cpu")
     seen = gaussians.select(visible_gaussian_rows(gaussians, camera))
-    raster, _ = render_gaussians(seen, camera, background, seen.sh_degree)
-    pixels: np.ndarray = raster.image.numpy()
-    return pixels
+    return render_gaussians(seen, camera, background, seen.sh_degree)[0]

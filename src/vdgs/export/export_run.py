@@ -19,6 +19,7 @@ from torch import Tensor
 
 from vdgs.captures.first_view import default_view
 from vdgs.captures.output_guard import check_no_link, check_not_among_inputs, check_output
+from vdgs.captures.reconstruction import place_name
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
@@ -48,12 +49,13 @@ from vdgs.export.local_frame import LocalFrame
 from vdgs.export.merged_scene import SceneMerging
 from vdgs.export.novel_cameras import color_iteration_count, endless_cameras
 from vdgs.export.programs import axes_for, with_files
+from vdgs.export.sh_degree_choice import FixedColors, choose_fixed_colors
 from vdgs.geometry.camera import Camera
 from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
-from vdgs.system.atomic_files import to_jsonable, write_json
+from vdgs.system.atomic_files import read_json_or_empty, to_jsonable, write_json
 from vdgs.system.console import make_progress_bar, print_warning
 from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
 from vdgs.system.scratch import check_takes_files, remove_leftovers
@@ -102,7 +104,8 @@ def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
     """The first view (`default_view`), before the color that the model has behind it; ground frame."""
     position, target = default_view(run.capture)
     red, green, blue = (float(each) for each in run.model.background)
-    title = run.capture.root.resolve().name or "scene"
+    recorded = read_json_or_empty(run.folder.place_file).get("name")  # as the report is headed
+    title = str(recorded or place_name(run.capture.root) or "scene")
     cameras = [view.camera for view in run.capture.train_views]
     return InitialView(
         _point(position), _point(target), (red, green, blue), title, most_bytes,
@@ -221,13 +224,16 @@ def write_files(
             rows = {path: rows_within_reach(path, frame, shown.spool.means) for path, frame in frames.items()}
         _optimize(shown, baker.training, request.optimize_seconds, console)
         seconds = time.monotonic() - began
-        scene = _BakedScene(shown.spool, request.sh_degree, page, request)
-        files = [_write_fitting(path, frames[path], scene, rows[path], merging) for path in request.output]
+        scene = _BakedScene(shown.spool, request.baked_sh_degree, page, request)
+        fixed = FixedColors(baker.training, request.output[0].parent / BAKING, stack)
+        files = [
+            _write_fitting(path, frames[path], scene, rows[path], merging, fixed, whole) for path in request.output
+        ]
         losses = _measure_losses(whole, frames, scene, request, console)
     if request.background is not None:
         write_background(run, request.background)
     record: ExportDocument = to_jsonable({
-        "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.sh_degree,
+        "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.baked_sh_degree,
         "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files,
         "losses": losses,
     })  # fmt: skip
@@ -247,17 +253,40 @@ def _print_systems(systems: Mapping[Path, FileCoordinates], console: Console) ->
 
 
 def _write_fitting(
-    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging
-) -> ExportedFile:
-    """Write a file, of as many Gaussians as it has room for."""
+    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging,
+    fixed: FixedColors, run: OpenedRun,
+) -> ExportedFile:  # fmt: skip
+    """Write a file, of as many Gaussians as it has room for, in colors that it holds well."""
     notes, count = list[str](), _capacity(path, scene)
     if count < len(rows):
         notes.append(f"merged from {len(rows):,} Gaussians to {count:,}, which the file has room for")
         scene, rows = replace(scene, spool=merging.merged(count).spool), np.arange(count)
     if not registry.format_from_path(path).only_points and (note := frame.departure_note(scene.spool.means[rows])):
         notes.append(note)
+    scene, note = _with_fitting_colors(path, frame, scene, rows, fixed, run)
+    notes += [note] if note else []
     system = coordinates_of_file(path, frame, scene.request)
     return _write(path, system, scene.scene(frame, rows, path), merging.console, notes)
+
+
+def _with_fitting_colors(
+    path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], fixed: FixedColors, run: OpenedRun
+) -> tuple[_BakedScene, str]:
+    """The scene with fixed colors for a file that holds no others or, where nobody asked for a degree, is no better for
+    them; and what is to be said of it."""
+    chosen = registry.format_from_path(path)
+    if not scene.degree:
+        return scene, ""
+    if not chosen.holds_changing_colors:
+        plain = replace(scene, spool=fixed.of(scene.spool), degree=0)
+        return plain, "colors are the mean of those from the directions of the training cameras"
+    if scene.request.sh_degree is not None or not (chosen.rounds_harmonics and scene.request.evaluate):
+        return scene, ""
+    plain = replace(scene, spool=fixed.of(scene.spool), degree=0)
+    is_fixed, note = choose_fixed_colors(
+        run, path, frame, lambda: scene.scene(frame, rows, path), lambda: scene.pieces(rows), lambda: plain.pieces(rows)
+    )
+    return plain if is_fixed else scene, note
 
 
 def _capacity(path: Path, scene: _BakedScene) -> int:

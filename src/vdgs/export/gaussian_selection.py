@@ -152,7 +152,7 @@ def select_rows(
 def _unwritten(frame: LocalFrame, count: int, request: ExportRequest, page: InitialView) -> ExportScene:
     """What is known of the scene of a file before anything is baked."""
     return ExportScene(
-        chunks=(), count=count, degree=request.sh_degree, metadata=frame.facts, page=page,
+        chunks=(), count=count, degree=request.baked_sh_degree, metadata=frame.facts, page=page,
         spz_version=request.spz_version,
     )  # fmt: skip
 

@@ -64,7 +64,7 @@ class LocalBake:
     def _fitted(self, kept: Int[np.ndarray, " m"], file: Path, bar: Progress) -> GaussianStore:
         """Gaussians as the training cameras saw them; what these saw is forgotten."""
         assert self._seen is not None
-        seen, degree, self._seen = self._seen, self._asked.sh_degree, None
+        seen, degree, self._seen = self._seen, self._asked.baked_sh_degree, None
         task = bar.add_task("fitting Gaussians", total=len(kept))
 
         def after_part(done: int) -> None:

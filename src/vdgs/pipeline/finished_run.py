@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,6 +25,9 @@ from vdgs.system.atomic_files import read_json_or_empty
 
 #: What photographs and masks are called.
 PICTURE_SUFFIXES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
+
+#: Options of `vdgs run`, beside `--sfm.*` and the folders, that a capture of photographs depends on.
+_PHOTOGRAPH_FLAGS = ("", "--capture", "--extra-image-folders", "--gps", "--scale-bar")
 
 
 def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ()) -> str:
@@ -49,7 +53,7 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     """Whether the run has the settings that are asked for, and is of this capture or of these photographs."""
     own = run.settings()
     if request.capture.resolve() != Path(own.capture_path):
-        if run.config.command() != command:
+        if run.config.command() != command and not same_photographs(run, command):
             return False
         gps, scale_bar = own.capture.gps, own.capture.scale_bar  # used by the reconstruction of the photographs alone
         request = replace(request, options=replace(request.options, gps=gps, scale_bar=scale_bar))
@@ -57,6 +61,26 @@ def _same_request(run: RunFolder, request: RunRequest, command: str) -> bool:
     if not training.iterations:  # follows from the number of photographs, which are the same
         method = replace(method, training=replace(training, iterations=own.training.iterations))
     return method == own.method and with_absolute_paths(request.options, request.capture) == own.capture
+
+
+def same_photographs(run: RunFolder, command: str) -> bool:
+    """Whether a command names the photographs that the run made its capture of, with the options that it was made with:
+    other words about the method, or another place of the run, do not count."""
+    made = SourceImages.read(run.own_capture)
+    if made is None or Path(run.settings().capture_path) != run.own_capture.resolve():
+        return False
+    return (made.command or "").startswith("vdgs run ") and _about_photographs(made.command or "") == (
+        _about_photographs(command)
+    )
+
+
+def _about_photographs(command: str) -> list[list[str]]:
+    """The words of `vdgs run` that say of which photographs a capture is made, and how."""
+    groups = [[""]]
+    for word in shlex.split(command)[2:]:
+        groups = [*groups, [word]] if word.startswith("--") else [*groups[:-1], [*groups[-1], word]]
+    kept = [group for group in groups if "sfm." in group[0] or group[0] in _PHOTOGRAPH_FLAGS]
+    return sorted(kept)
 
 
 def _is_whole(run: RunFolder, request: RunRequest) -> bool:

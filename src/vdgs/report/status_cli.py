@@ -85,19 +85,29 @@ def print_status(run: RunFolder, console: Console) -> int:
     console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
     if status.is_complete:
         console.print(escape(f"report: {status.path / REPORT_FILE}"), highlight=False)
-    console.print(escape(next_line(status)), highlight=False)
+    missing = "" if status.is_running else _missing_capture(run)
+    console.print(escape(f"to mend: {missing}" if missing else next_line(status)), highlight=False)
     return 0 if status.is_complete else EXIT_INCOMPLETE
 
 
 def status_json(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
     status, place = full_run_status(run), _place(run)
+    missing = "" if status.is_running else _missing_capture(run)
     return {
         "run": str(run.path), "place": None if place is None else to_jsonable(record_to_dict(place)),
         "complete": status.is_complete, "running": status.is_running,
-        "next_command": status.next_command() or None, "problem": status.problem or None,
+        "next_command": (not missing and status.next_command()) or None, "problem": missing or status.problem or None,
         "stages": [_stage_json(stage) for stage in status.stages],
     }  # fmt: skip
+
+
+def _missing_capture(run: RunFolder) -> str:
+    """That the capture of the run is not there, and what to do; empty where it is, or where nothing says which."""
+    try:
+        return run.missing_capture()
+    except VdgsError:  # no settings yet, or damaged ones
+        return ""
 
 
 def _place(run: RunFolder) -> PlaceFacts | None:

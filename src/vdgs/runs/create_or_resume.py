@@ -14,6 +14,7 @@ from vdgs.captures.output_guard import check_not_among_inputs, check_output
 from vdgs.captures.place_facts import measure_place
 from vdgs.captures.reconstruction import RECONSTRUCTION_FIGURE as RECONSTRUCTION_FIGURE
 from vdgs.captures.reconstruction import RECONSTRUCTION_FILE as RECONSTRUCTION
+from vdgs.captures.reconstruction import place_name
 from vdgs.captures.validation import require_valid
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig, resolve_iterations
@@ -117,9 +118,9 @@ def _copy_reconstruction(root: Path, run: Path) -> None:
 
 
 def _write_place(capture: Capture, run: RunFolder) -> None:
-    """Save the facts of the place that the report and `vdgs status` begin with, unless they are there."""
-    fingerprint = capture_fingerprint(capture)
-    if read_json_or_empty(run.place_file).get("fingerprint") != fingerprint:
+    """Save the facts of the place that the report and `vdgs status` begin with, unless they are there, of this name."""
+    fingerprint, saved = capture_fingerprint(capture), read_json_or_empty(run.place_file)
+    if (saved.get("fingerprint"), saved.get("name")) != (fingerprint, place_name(capture.root)):
         write_json(run.place_file, to_jsonable(record_to_dict(measure_place(capture)) | {"fingerprint": fingerprint}))
 
 

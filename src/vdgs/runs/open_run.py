@@ -170,13 +170,9 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
     Raises CaptureError if it is gone or changed its form.
     """
     settings = folder.settings() if at is None else folder.settings().moved(at)
-    path = Path(settings.capture_path)
-    if at is None and not path.exists():
-        raise CaptureError(
-            f"{path}: the capture of {folder.path} is not there. If it was moved, say where to, once: "
-            f"vdgs visibility {shell_word(folder.path)} --capture PATH"
-        )
-    return load_capture(path, settings.capture)
+    if at is None and (why := folder.missing_capture()):
+        raise CaptureError(why)
+    return load_capture(Path(settings.capture_path), settings.capture)
 
 
 def relocate_capture(folder: RunFolder, at: Path) -> Capture:

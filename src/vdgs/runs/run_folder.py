@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.captures.reconstruction import OWN_CAPTURE, RECONSTRUCTION_FILE, is_reconstruction
 from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.block_records import PartitionRecord
@@ -41,7 +41,7 @@ class RunFolder:
     @property
     def own_capture(self) -> Path:
         """The capture that a run of photographs alone makes of them."""
-        return self.path / "capture"
+        return self.path / OWN_CAPTURE
 
     @property
     def config_file(self) -> Path:
@@ -143,6 +143,7 @@ class RunFolder:
         """
         old = self.settings()
         if old == settings:
+            self.move_capture(Path(settings.capture_path))  # it may have moved with the run
             return []
         changed, after = changed_flags(old, settings), self.keys(settings)
         lost = self.find_lost(settings)
@@ -185,7 +186,7 @@ class RunFolder:
     def move_capture(self, to: Path) -> None:
         """Save that the capture of the run lies elsewhere now, with the files in it that options name; the caller
         checks that it is the same one."""
-        settings, command = self.settings(), self.config.command()
+        settings, command = self.config.settings(), self.config.command()
         before, now = settings.capture_path, str(to.resolve())
         if before == now:
             return
@@ -195,8 +196,31 @@ class RunFolder:
         self.config.write(settings.moved(to.resolve()), moved)
 
     def settings(self) -> RunSettings:
-        """The settings of the run (`ConfigFile.settings`)."""
-        return self.config.settings()
+        """The settings of the run (`ConfigFile.settings`). A capture that the run made in its own folder lies where
+        this folder lies now, moved or copied."""
+        settings = self.config.settings()
+        return settings.moved(self.own_capture.resolve()) if self._holds_capture_of(settings) else settings
+
+    def _holds_capture_of(self, settings: RunSettings) -> bool:
+        """Whether `own_capture` is the capture that the settings have at a place in another folder: one of its name
+        that was made here, with the reconstruction that the run was begun with."""
+        written, own = Path(settings.capture_path), self.own_capture
+        if written.name != own.name or written == own.resolve() or not is_reconstruction(own):
+            return False
+        copy, original = (folder / RECONSTRUCTION_FILE for folder in (self.path, own))
+        if not (copy.is_file() and original.is_file()):
+            return copy.is_file() == original.is_file()
+        return copy.read_bytes() == original.read_bytes()
+
+    def missing_capture(self) -> str:
+        """That the capture of the run is not where the run looks for it, and what to do; empty where it is there."""
+        path = Path(self.settings().capture_path)
+        if path.exists():
+            return ""
+        return (
+            f"{path}: the capture of {self.path} is not there. If it was moved, say where to, once: "
+            f"vdgs visibility {shell_word(self.path)} --capture PATH"
+        )
 
     def method(self) -> MethodConfig:
         """The settings of the run but for the capture."""

@@ -98,9 +98,9 @@ def reconstruct(
     before = None if left == "all" else read_reconstruction(output)
     if before is not None and left == "nothing":
         console.print(describe_work_left(request, left), highlight=False)
-        if SourceImages.read(output) != sources:  # of files that are not used
-            sources.write(output)
-        with suppress(VdgsError):  # it saves reading, and the folder may be read-only
+        with suppress(VdgsError):  # they save reading and advice, and the folder may be read-only
+            if SourceImages.read(output) != sources:  # of files that are not used, or the command
+                sources.write(output)
             digests.write()
             forget_agreement(output)
         if not request.keep_intermediate:

@@ -48,6 +48,9 @@ class ClientSession:
         self._lock = threading.RLock()
         self._display = DisplayOptions(model=scene.names[0])
         self._camera: Camera | None = None
+        # The canvas that the first view was fitted to last; None: as the server lets every browser begin.
+        self._fitted: tuple[int, int] | None = None
+        self._is_at_first_view = True
         # Fixed for the session: with another limit at every move, a camera at rest would seem to move.
         self._max_pixels = navigation.max_render_pixels(available_memory_bytes())
         self._arrived = False
@@ -55,12 +58,11 @@ class ClientSession:
         self.painter = Painter(scene)
         self._render_session = scheduler.add_session(self.painter, self._send_frame, self._on_render_error)
         self._build()
-        client.camera.on_update(lambda _: self._on_camera_moved())
+        client.camera.on_update(lambda _: self._on_browser_moved())
         client.scene.on_click()(lambda event: self.point_panel.on_click(event.screen_pos))
         height = scene.camera_height
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
-        self._on_camera_moved()
-        self._step_back_if_narrow()
+        self._on_browser_moved()
 
     @property
     def camera(self) -> Camera | None:
@@ -149,14 +151,29 @@ class ClientSession:
                 self._hide_image_if_left(camera)
             self.scheduler.request_frame(self._render_session, camera, self._display)
 
-    def _step_back_if_narrow(self) -> None:
-        """All browsers begin where a window at least as wide as high shows all: a narrower one must stand farther
-        away. Where an address names another first view, that stays."""
-        if self._camera is None or self._camera.width >= self._camera.height:
+    def _on_browser_moved(self) -> None:
+        self._on_camera_moved()
+        if self._is_at_first_view and self._camera is not None and self._canvas != self._fitted:
+            self._fit_first_view()
+
+    def _fit_first_view(self) -> None:
+        """All browsers begin where a wide window shows all: in one that is higher than wide, or where the panel would
+        cover a part, one must stand farther away or aside, and so again where the canvas changes before anybody moves
+        (it is laid out in steps). Where an address names another first view, that stays."""
+        canvas, first = self._canvas, self.scene.first_view
+        begin = first if self._fitted is None else navigation.fitted_pose(first, self._fitted)
+        self._is_at_first_view = np.allclose(self.pose.position, begin.position, atol=1e-3 * begin.distance)
+        if not self._is_at_first_view:
             return
-        begin = navigation.overview_pose(self.scene.capture)
-        if np.allclose(self.pose.position, begin.position, atol=1e-3 * begin.distance):
-            self.move_to(navigation.overview_pose(self.scene.capture, self._camera.width / self._camera.height))
+        fitted = navigation.fitted_pose(first, canvas)
+        self._fitted = canvas
+        if not np.allclose(fitted.position, begin.position, atol=1e-6 * begin.distance):
+            self.move_to(fitted)
+
+    @property
+    def _canvas(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return int(self.client.camera.image_width), int(self.client.camera.image_height)
 
     def _hide_image_if_left(self, camera: Camera) -> None:
         index = self._display.image_index
@@ -258,7 +275,7 @@ class ClientSession:
         @buttons.on_click
         def _(_: Any) -> None:
             poses: dict[str, Callable[[], CameraPose]] = {
-                "All": lambda: navigation.overview_pose(self.scene.capture, self.client.camera.aspect, whole=True),
+                "All": lambda: navigation.overview_pose(self.scene.capture, self._canvas, whole=True),
                 "From above": lambda: navigation.top_down_pose(self.pose),
                 "North up": lambda: navigation.north_up_pose(self.pose),
             }

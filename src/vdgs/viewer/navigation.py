@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.capture import Capture
-from vdgs.captures.first_view import default_view
+from vdgs.captures.first_view import FOV_DEG, default_view
 from vdgs.config.commands import MAX_RENDER_SIDE_PX, RENDER_BYTES_PER_PIXEL
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import pose_from_rotation
@@ -20,6 +20,12 @@ _NADIR_COSINE = 0.995
 _NADIR_TILT = 1e-3
 #: No canvas has more pixels: those of a screen of 8K (choice).
 MAX_CANVAS_PIXELS = 7680 * 4320
+#: The panel and its margin, at the right, in pixels of the page (`control_width` medium). Windows up to the other width
+#: have the panel below. A canvas so wide is taken for one of a screen of two pixels for each of the page (choice).
+PANEL_PX, MAX_MOBILE_WIDTH_PX, DENSE_WIDTH_PX = 335, 576, 2000
+#: `default_view` fills a share of the height with what many cameras see. With what fewer see at its ends, what is shown
+#: is so many heights wide (choice).
+NEEDED_SHARE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +77,31 @@ def _rotation_matrix(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + 2.0 * (w * cross + cross @ cross)
 
 
-def overview_pose(capture: Capture, aspect: float = 1.0, whole: bool = False) -> CameraPose:
-    """The first view, on a canvas of this width over its height: all of the flight, or unless the `whole` is asked for,
-    what the photographs look at (`default_view`)."""
-    position, target = default_view(capture, whole)
-    return CameraPose(target + max(1.0, 1.0 / aspect) * (position - target), target)
+def overview_pose(capture: Capture, canvas: tuple[int, int] | None = None, whole: bool = False) -> CameraPose:
+    """The first view, on a canvas of this width and height in pixels (None: one that hides nothing): all of the flight,
+    or unless the `whole` is asked for, what the photographs look at (`default_view`)."""
+    pose = CameraPose(*default_view(capture, whole))
+    return pose if canvas is None else fitted_pose(pose, canvas)
+
+
+def fitted_pose(pose: CameraPose, canvas: tuple[int, int]) -> CameraPose:
+    """A first view on a canvas of this width and height (`fit_beside_panel`)."""
+    farther, aside = fit_beside_panel(*canvas)
+    target, away = pose.look_at, farther * (pose.position - pose.look_at)
+    right = np.cross((0.0, 0.0, 1.0), away)
+    right *= aside * 2 * math.tan(math.radians(FOV_DEG / 2)) * np.linalg.norm(away) / np.linalg.norm(right)
+    return CameraPose(target + away + right, target + right)
+
+
+def fit_beside_panel(width: int, height: int) -> tuple[float, float]:
+    """How many times farther one stands than `default_view`, and how far to the right of it, in heights of the picture:
+    so that what is shown lies beside the panel, in the middle of what is free or left of the middle of the window."""
+    if width < height or width <= MAX_MOBILE_WIDTH_PX:
+        return max(1.0, height / width), 0.0
+    panel = (2 if width >= DENSE_WIDTH_PX else 1) * PANEL_PX
+    needed, free = NEEDED_SHARE * height / 2, width / 2 - panel
+    shift = min(max(needed - free, 0.0), panel / 2)
+    return max(1.0, needed / (free + shift)), shift / height
 
 
 def top_down_pose(pose: CameraPose) -> CameraPose:

@@ -22,7 +22,6 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from vdgs.captures.camera_height import camera_height
 from vdgs.captures.first_view import FOV_DEG
 from vdgs.config.commands import ViewRequest
 from vdgs.errors import Interrupted, VdgsError
@@ -34,7 +33,6 @@ from vdgs.system.console import print_warning
 from vdgs.system.memory.process_memory import limit_malloc_arenas
 from vdgs.system.quoting import shell_word
 from vdgs.system.stop_signals import catch_stop_signals, check_stop_requested
-from vdgs.viewer import navigation
 from vdgs.viewer.access_control import ALL_INTERFACES, AccessControl, is_loopback
 from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
@@ -125,7 +123,7 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
     scene.tree(scene.names[0])  # a damaged one is refused here
     access, server = _start_listening(host, port, console)
     viewer = ViewerServer(server=server, access=access, scene=scene, scheduler=scheduler, sessions={})
-    _set_initial_camera(server, run)
+    _set_initial_camera(server, scene)
 
     async def identify(client: Any) -> None:  # in the connection's own context, before `on_connect`
         viewer.visits.begin(client.client_id, _browser.get())
@@ -170,10 +168,10 @@ def serve(run: OpenedRun, host: str, port: int | None, console: Console) -> Iter
         gc.unfreeze()
 
 
-def _set_initial_camera(server: Any, run: OpenedRun) -> None:
-    """Where viser lets every new connection stand, in a window at least as wide as high. A session moves on from there:
-    in a narrower window, and where its browser stood before (`Visits.welcome`)."""
-    stand, height = navigation.overview_pose(run.capture), camera_height(run.capture)
+def _set_initial_camera(server: Any, scene: ViewerScene) -> None:
+    """Where viser lets every new connection stand, in a wide window. A session moves on from there: in a narrower
+    window, and where its browser stood before (`Visits.welcome`)."""
+    stand, height = scene.first_view, scene.camera_height
     start = server.initial_camera
     start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
     start.position, start.look_at = tuple(stand.position), tuple(stand.look_at)

@@ -30,6 +30,7 @@ from vdgs.runs.lod_folder import find_tree
 from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
 from vdgs.runs.visibility_store import get_run_visibility, with_fade
 from vdgs.viewer.lod import LodLevel, LodPyramid
+from vdgs.viewer.navigation import CameraPose, overview_pose
 from vdgs.visibility.visibility_counts import NearbyCameras, count_visibility
 
 #: Of a tree: pixels that a view at rest and a preview may be off, and what a view at rest may cost, in merged Gaussians
@@ -256,6 +257,11 @@ class ViewerScene:
     def camera_height(self) -> float:
         """How high the photographs were taken (`captures.camera_height`): it takes all sparse points to tell."""
         return camera_height(self.capture)
+
+    @cached_property
+    def first_view(self) -> CameraPose:
+        """Where a visitor stands first, in a wide window."""
+        return overview_pose(self.capture)
 
     @cached_property
     def view_rays(self) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:

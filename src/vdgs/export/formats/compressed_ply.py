@@ -13,7 +13,7 @@ from typing import IO
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt32
+from jaxtyping import Float, UInt8, UInt32
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.axes import Y_DOWN, Axes, axes_named
@@ -55,8 +55,10 @@ LARGEST_LOG = 20.0
 SPAN = 8.0
 LOST = (
     "positions and sizes are rounded to 1/2047 of what their chunk of 256 neighbors spans (along the second axis to "
-    "1/1023), colors to bytes, changing "
-    f"colors to {SPAN / 256:.3f}"
+    "1/1023), colors to bytes"
+)
+LOST_CHANGES = (
+    f"coefficients of changing colors are rounded to {SPAN / 256:.3f}, up or down so that neighbors keep their mean"
 )
 
 
@@ -73,6 +75,7 @@ def write_compressed_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
         with scratch_folder(path) as folder:
             held = write_store(scene, folder / "rows", axes)
             order = get_backend(torch.device("cpu")).morton_order(torch.from_numpy(held.means)).numpy()
+            rounding = _HarmonicRounding(coefficients)
             with temporary.open("wb") as file:
                 file.write(header)
                 for first in range(0, count, CHUNK_SIZE):  # whole chunks: CHUNK_SIZE is a multiple of CHUNK
@@ -80,11 +83,11 @@ def write_compressed_ply(path: Path, scene: ExportScene) -> tuple[str, ...]:
                     bounds, packed = _packed(piece)
                     _put(file, len(header) + first // CHUNK * 4 * len(BOUNDS), bounds)
                     _put(file, vertices + first * 4 * len(PACKED), packed)
-                    _put(file, harmonics + first * coefficients, _bytes_of_harmonics(piece))
+                    _put(file, harmonics + first * coefficients, rounding.to_bytes(piece))
 
     write_atomic(path, write)
     write_crs_beside(path, scene.metadata)
-    return (LOST,)
+    return (LOST, LOST_CHANGES) if coefficients else (LOST,)
 
 
 def _header(scene: ExportScene, axes: Axes, coefficients: int) -> bytes:
@@ -141,16 +144,27 @@ def _rotation(quaternions: Float[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]
     return (largest.astype(np.uint32) << np.uint32(30)) | _join(small, (10, 10, 10))
 
 
-def _bytes_of_harmonics(piece: Gaussians) -> np.ndarray:
-    """Channel by channel, as in a plain PLY; a byte stands for the middle of what it covers.
+class _HarmonicRounding:
+    """Bytes for the coefficients of changing colors, channel by channel, as in a plain PLY.
 
-    Zero, as what does not change with the direction has it, lies between two bytes. Such values go up and down in
-    turn, from coefficient to coefficient and Gaussian to Gaussian: all of them up would make the scene brighter."""
-    places = (piece.shN.numpy().transpose(0, 2, 1) / SPAN + 0.5) * 256
-    coded = np.floor(places)
-    rows, channels, bands = np.ogrid[tuple(map(slice, places.shape))]
-    coded -= (coded == places) & ((rows + channels + bands) % 2 == 1)
-    return np.clip(coded, 0, 255).astype(np.uint8)
+    A byte stands for the middle of a step of 1/32: there is none for zero, and most coefficients are smaller than the
+    least that there is, 1/64. The nearest byte would turn each into that, and what neighbors have in common would grow
+    many times. So a Gaussian takes over what the one before it in the file, a neighbor in Morton order, was rounded
+    too far: sums along the file are right within a step.
+    """
+
+    def __init__(self, coefficients: int) -> None:
+        # Each begins at another place within a step, in no order, so that at any Gaussian about half are rounded up.
+        self._over = (np.random.default_rng(0).permutation(coefficients) + 0.5) / max(coefficients, 1)
+
+    def to_bytes(self, piece: Gaussians) -> UInt8[np.ndarray, "n c"]:
+        """The bytes of the next Gaussians of the file."""
+        wanted = piece.shN.numpy().transpose(0, 2, 1).reshape(len(piece), -1).astype(np.float64)
+        steps = np.clip((wanted / SPAN + 0.5) * 256 - 0.5, 0, 255)
+        sums = self._over + np.cumsum(steps, 0)
+        whole = np.floor(np.concatenate([self._over[None], sums]))
+        self._over = sums[-1] - whole[-1]
+        return np.clip(np.diff(whole, axis=0), 0, 255).astype(np.uint8)
 
 
 def is_compressed(header: PlyHeader) -> bool:

@@ -63,6 +63,8 @@ class ExportFormat:
     reach_in_extents: float | None = None
     #: Whether its colors do not change with the direction: best baked so, where all files are of that kind.
     fixed_colors: bool = False
+    #: Whether it rounds the coefficients of changing colors so that they may be worth less than the room they take.
+    rounds_harmonics: bool = False
     #: Whether it holds points without shapes, which stand where a map has them exactly.
     only_points: bool = False
     #: Whether it stands on the globe, in no map's coordinates.
@@ -73,6 +75,11 @@ class ExportFormat:
     folder: FileFolder | None = None
     #: What is written beside the file under a name of its own.
     page_file: str | None = None
+
+    @property
+    def holds_changing_colors(self) -> bool:
+        """Whether colors may change with the direction."""
+        return not (self.fixed_colors or self.only_points)
 
     def names(self, path: Path) -> list[Path]:
         """The files that are written under names which another output could have too."""
@@ -105,6 +112,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".compressed.ply",
         description="PlayCanvas' compressed PLY, a quarter",
         write=write_compressed_ply,
+        rounds_harmonics=True,
         axes=Y_DOWN,
         read=read_any_ply,
         facts_file=beside_ply,
@@ -120,6 +128,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".spz",
         description="SPZ, a sixth of the PLY or less",
         write=write_spz,
+        rounds_harmonics=True,
         axes=Y_UP,
         read=read_spz_chunks,
         check=check_range,
@@ -131,6 +140,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".splat",
         description="32 bytes a Gaussian, fixed colors",
         write=write_splat,
+        fixed_colors=True,
         axes=Y_DOWN,
         read=read_splat_chunks,
         writes_metadata_file=True,
@@ -140,6 +150,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".sog",
         description="PlayCanvas' SOG, a twelfth of the PLY or less",
         write=write_sog,
+        rounds_harmonics=True,
         axes=Y_DOWN,
         writes_metadata_file=True,
         facts_file=metadata_path,
@@ -148,6 +159,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=".rad",
         description="Spark's RAD, with levels",
         write=write_rad,
+        rounds_harmonics=True,
         axes=Y_UP,
         writes_metadata_file=True,
         facts_file=metadata_path,
@@ -163,6 +175,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=TILESET_FILE,
         description="3D Tiles for CesiumJS, in levels",
         write=write_tiles,
+        rounds_harmonics=True,
         check=check_tileset_folder,
         on_globe=True,
         folder=TILE_FOLDER,
@@ -171,6 +184,7 @@ FORMATS: tuple[ExportFormat, ...] = (
         suffix=LOD_FILE,
         description="PlayCanvas' streamed SOG, in levels",
         write=write_streamed_sog,
+        rounds_harmonics=True,
         axes=Y_DOWN,
         check=check_lod_folder,
         writes_metadata_file=True,
