@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -210,3 +211,36 @@ def test_a_block_of_another_coarse_model_is_refused():
 def test_as_many_models_as_blocks():
     with pytest.raises(ValueError, match="3 models and 4 camera lists for 4 blocks"):
         merge_blocks(scattered(), [scattered()] * 3, quadrants(), NO_CAMERAS, OWNER)
+
+
+def turned(blocks: Blocks) -> Blocks:
+    """As many blocks, cut along the diagonals."""
+    return Blocks(tuple(Block(*(shapely.affinity.rotate(each, 45, (0, 0)) for each in (b.core, b.expanded)))
+                        for b in blocks.items))  # fmt: skip
+
+
+@pytest.mark.parametrize("config", [OWNER, BEST_SEEN])
+@pytest.mark.parametrize("margin", ["frozen", "ramp"])
+def test_blocks_of_another_cut_are_refused(config: MergeConfig, margin: str):
+    """As many blocks, of the same coarse scene: what one owns now is in the model of another."""
+    blocks, coarse, rng = quadrants(), scattered(500), np.random.default_rng(0)
+    cameras = [[camera_above(0, 0)]] * 4
+    reached = [blocks.in_expanded(i, places(coarse)) for i in range(4)]
+    own = reached if margin == "ramp" else [quadrant_of(places(coarse)) == i for i in range(4)]
+    trained = [part(coarse, mask & (rng.random(500) > 0.3)) for mask in own]  # training has removed a third
+    merge_blocks(coarse, trained, blocks, cameras, config)
+    with pytest.raises(VdgsError, match=r"trained for another cut of the scene(?s:.)*Give the blocks and the assign"):
+        merge_blocks(coarse, trained, turned(blocks), cameras, config)
+    trained[1] = None
+    merge_blocks(coarse, trained, blocks, cameras, config, allow_missing=True)
+    with pytest.raises(VdgsError, match="trained for another cut of the scene"):
+        merge_blocks(coarse, trained, turned(blocks), cameras, config, allow_missing=True)
+
+
+def test_a_rule_that_would_lose_what_only_the_owner_has_is_refused():
+    blocks, coarse = quadrants(), scattered(500)
+    trained = [part(coarse, quadrant_of(places(coarse)) == i) for i in range(4)]
+    cameras = [[camera_above(-2, -2)] * count for count in (3, 1, 1, 1)]
+    merge_blocks(coarse, trained, blocks, cameras, OWNER)
+    with pytest.raises(VdgsError, match=r"'max-visibility' would lose \d+ anchors.*Merge with rule='owner'"):
+        merge_blocks(coarse, trained, blocks, cameras, BEST_SEEN)

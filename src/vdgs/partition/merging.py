@@ -23,6 +23,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.partition.merge_checks import AnchorOrigins
 from vdgs.visibility.visibility_counts import count_visibility
 
 
@@ -43,8 +44,9 @@ def merge_blocks(
     it: then one block at a time is in memory. Memory: coarse and merged anchors, and half of the merged ones again.
     Blocks that trained one decoder together share it.
 
-    Raises VdgsError for a missing block (unless allowed), for a model that says that it is of another block, and for
-    one that shows that it was not trained from `coarse`: by its grid, or by other bits of a frozen decoder.
+    Raises VdgsError for a missing block (unless allowed), for a model that says that it is of another block, for one
+    that shows that it was not trained from `coarse`: by its grid, or by other bits of a frozen decoder; and for models
+    of another cut, whose anchors would be lost (`AnchorOrigins`).
     """
     if not len(block_models) == len(cameras_of_block) == len(blocks):
         raise ValueError(
@@ -55,16 +57,19 @@ def merge_blocks(
         raise VdgsError(_missing_message(missing))
     coarse_owner = blocks.owner(xy_positions(coarse.anchors.positions)) if missing else None
     selected, spans, records, own_decoder = [], [], [], False
+    origins = AnchorOrigins(coarse.anchors.positions, blocks)
     for index, given in enumerate(block_models):
         model = given() if callable(given) else given
         if model is None:
             assert coarse_owner is not None
             anchors = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
+            origins.stand_in(anchors.positions)
             trained, kept = 0, 0
         else:
             _check_block_model(index, model, coarse)
             sources = block_of_points(model.anchors.positions, blocks, cameras_of_block, config, missing)
             anchors = model.anchors.select(torch.from_numpy(sources == index))
+            origins.add(index, model.anchors.positions, sources == index)
             trained, kept = len(model.anchors), len(anchors)
             own_decoder = own_decoder or has_own_decoder(model)
         unseen = int((count_visibility(anchors.positions, cameras_of_block[index]) == 0).sum())
@@ -79,6 +84,8 @@ def merge_blocks(
                 coarse_fallback=len(anchors) if model is None else 0, unseen=unseen,
             )
         )  # fmt: skip
+    origins.check(config.rule)
+    del origins
     merged = replace(coarse, anchors=_concatenate(selected))
     if config.reference_exposure == "global":
         merged = merged.without_local_exposure()
