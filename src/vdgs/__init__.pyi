@@ -25,6 +25,7 @@ from vdgs.ops.api import train as train
 from vdgs.ops.api import view as view
 from vdgs.ops.api import visibility_ratio as visibility_ratio
 from vdgs.ops.arrays import cameras_from as cameras_from
+from vdgs.ops.capture_arrays import write_capture as write_capture
 from vdgs.training.compensated_growth import CompensatedGrowth as CompensatedGrowth
 
 __version__: str

@@ -45,6 +45,14 @@ class View:
     #: Some of the points that the capture says this photograph shows, where it says so (ground frame).
     observations: Observations | None = field(default=None, repr=False)
 
+    def __post_init__(self) -> None:
+        for name, path in (("image_path", self.image_path), ("mask_path", self.mask_path)):
+            if not isinstance(path, Path) and (name, path) != ("mask_path", None):
+                raise TypeError(
+                    f"{name} must be pathlib.Path, not {type(path).__name__}: vdgs.write_capture(FOLDER, images, "
+                    "cameras) writes pictures in memory as a capture"
+                )
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:

@@ -87,8 +87,10 @@ class Camera:
         return self.uncropped_size or (self.width, self.height)
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Camera:
-        """The part of this picture with columns `left` to `right` and rows `top` to `bottom`, both without the last:
-        what it draws is what the whole picture shows there. Raises ValueError where that is no part of it."""
+        """The part of this picture with columns `left` to `right` and rows `top` to `bottom`, both without the last.
+
+        It draws what the whole picture shows there, but for single pixels at the edges of Gaussians (by up to 8 of 255:
+        a Gaussian's bounds are rounded anew). Raises ValueError where that is no part of it."""
         if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
             box = f"columns {left} to {right} and rows {top} to {bottom}"
             raise ValueError(f"{box} are no part of a picture of {self.width}x{self.height}")
@@ -146,6 +148,16 @@ class Camera:
         return (depth > NEAR_PLANE) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
 
+#: Poses whose rotation is this far from one (R Rᵀ from 1) are taken for rounded ones: three decimals leave 0.002.
+ROUNDING_TOLERANCE = 5e-3
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The orthonormal matrix [3, 3] that is nearest to one."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right)
+
+
 def is_rigid_motion(matrix: np.ndarray, tolerance: float = 1e-4) -> bool:
     """Whether a matrix [4, 4] is a rotation (R Rᵀ = 1 to `tolerance`) and a translation: finite, without a scale, not
     mirrored or transposed."""
@@ -170,7 +182,10 @@ def check_camera(name: str, camera: object, remedy: str = "") -> None:
     camera = cast("Camera", camera)
     pose, sides = camera.camera_from_world, (camera.width, camera.height)
     if not (isinstance(pose, np.ndarray) and pose.shape == (4, 4) and is_rigid_motion(pose)):
-        raise VdgsError(f"{name}: camera_from_world must be a rotation and a translation, [4, 4] of numpy, not {pose}")
+        raise VdgsError(
+            f"{name}: camera_from_world must be a rotation and a translation, [4, 4] of numpy, not {pose} "
+            "(vdgs.cameras_from takes rounded ones)"
+        )
     if not all(isinstance(side, Integral) and side >= 1 for side in sides):
         raise VdgsError(f"{name}: width and height must be whole numbers of pixels, at least 1, not {sides}")
     lens = (camera.fx, camera.fy, camera.cx, camera.cy)

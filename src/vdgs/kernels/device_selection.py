@@ -37,9 +37,11 @@ class SelectedDevice:
     reason: str
 
 
-def select_device(device: str) -> SelectedDevice:
-    """The device for `auto` (the first card that can be used, else the processor), `cpu`, `cuda` or `cuda:i`. Raises
-    DeviceUnavailable for a GPU that is absent or cannot be used, VdgsError for another value."""
+def select_device(device: object) -> SelectedDevice:
+    """The device for `auto` (the first card that can be used, else the processor), `cpu`, `cuda` or `cuda:i`, or a
+    torch.device. Raises DeviceUnavailable for a GPU that is absent or cannot be used, VdgsError for another value."""
+    if not isinstance(device, str):  # a torch.device, whose module need not be loaded for it
+        device = "cpu" if getattr(device, "type", "") == "cpu" else str(device)
     named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
     if named is None:
         raise VdgsError(f"--device {device}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")

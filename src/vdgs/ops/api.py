@@ -28,19 +28,21 @@ from vdgs.config.ranges import MAX_COUNT, Range
 from vdgs.config.type_hints import field_hints
 from vdgs.config.typed_paths import home_path
 from vdgs.config.validation_rules import checked_settings, checked_value
-from vdgs.errors import CaptureError, VdgsError, check_kind
+from vdgs.errors import CaptureError, RunError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
 from vdgs.geometry.camera import check_camera, check_cameras
 from vdgs.kernels.device_selection import select_device
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.ops.arrays import Array, as_tensor, check_finite_points, check_image_index, like
+from vdgs.ops.arrays import Array, as_tensor, check_finite_points, check_image_index, like, without_autocast
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
+from vdgs.partition.merging import missing_message
 from vdgs.runs import open_run as runs
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder, StatusRecord
+from vdgs.system.stop_signals import stops_as_python
 from vdgs.system.tensors import REBUILD_HINT
 
 _COLOR = Annotated[tuple[float, float, float], Range(0, 1)]
@@ -163,15 +165,23 @@ class Run:
 
     @cached_property
     def block_scenes(self) -> list[Scene]:
-        """The trained blocks, each with the anchors that it moves. Raises RunError where one is not trained."""
-        key, capture = self.folder.keys().blocks, self.scene.capture
+        """The trained blocks, each with the anchors that it moves. Raises RunError where one is not trained, with the
+        command that trains it."""
+        key = self.folder.keys().blocks
         stages = [self.folder.block(index) for index in range(len(self.blocks))]
+        if missing := [index for index, stage in enumerate(stages) if not stage.is_done(key)]:
+            raise RunError(f"{self.path}: {missing_message(missing, self.path)}")
+        capture = self.scene.capture
         models = (load_verified(stage, key, index) for index, stage in enumerate(stages))
         return [Scene(model.to(torch.device(self.device)), capture) for model in models]
 
 
 def open_run(
-    path: str | Path, *, model: ModelName = "best", device: str = "cpu", capture: str | Path | None = None
+    path: str | Path,
+    *,
+    model: ModelName = "best",
+    device: str | torch.device = "cpu",
+    capture: str | Path | None = None,
 ) -> Run:
     """Open a run folder: `.scene`, `.capture`, `.blocks`, `.assignment`, `.block_scenes`, `.settings`.
 
@@ -249,7 +259,8 @@ def render(
     color = None if background is None else _checked_color("background", background)
     num_images = MAX_COUNT if scene.capture is None else len(scene.capture.train_views)
     index = check_image_index(image_index, (decoder for _, _, decoder in scene.model.decoder_ranges()), num_images)
-    raster = draw(scene.model, camera, background=color, depth=mode != "rgb", image_index=index)
+    with without_autocast(scene.positions.device):
+        raster = draw(scene.model, camera, background=color, depth=mode != "rgb", image_index=index)
     if raster.depth is None or raster.median_depth is None:
         return Render(raster.image, raster.alpha, None, None)
     median = raster.median_depth.masked_fill(raster.median_depth == 0, torch.nan)
@@ -356,14 +367,15 @@ def assign_cameras(
     check_kind("blocks", blocks, Blocks, remedy="vdgs.partition makes them")
     check_cameras(cameras)
     config = _checked_config("config", AssignmentConfig() if config is None else config, AssignmentConfig)
-    decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
+    with without_autocast(scene.positions.device):
+        decided = assignment.assign_cameras(compute_score_matrix(scene.model, blocks, cameras, config), config)
     _warn(decided.warnings)
     return decided
 
 
 def merge(
     scene: Scene,
-    block_scenes: Sequence[Scene],
+    block_scenes: Iterable[Scene],
     blocks: Blocks,
     assignment: Assignment,
     *,
@@ -371,13 +383,16 @@ def merge(
 ) -> Scene:
     """One scene from trained blocks: every place takes its anchors from exactly one block.
 
-    `scene` is the coarse scene that the blocks were trained from; the rows of `assignment` are its training cameras.
-    The merged scene is on its device, wherever the blocks are.
-    Raises VdgsError for blocks of another coarse scene or in another order, ValueError where the numbers do not fit,
-    TypeError for arguments of another kind.
+    `scene` is the coarse scene that the blocks were trained from; `blocks` is the cut that they were trained for
+    (`.blocks` of the run), and the rows of `assignment` are its training cameras. The merged scene is on its device,
+    wherever the blocks are.
+    Raises VdgsError for blocks of another coarse scene, of another cut or in another order, and for a rule that would
+    lose anchors; ValueError where the numbers do not fit, TypeError for arguments of another kind.
     """
     from vdgs.partition.merging import merge_blocks
 
+    check_kind("block_scenes", block_scenes, Iterable, remedy="give a list of scenes")
+    block_scenes = list(block_scenes)
     for each in (scene, *block_scenes):
         _check_scene(each)
     check_kind("blocks", blocks, Blocks, remedy="vdgs.partition makes them")
@@ -415,7 +430,8 @@ def export(scene: Scene | Run, path: str | Path, **options: Any) -> None:
         folder=RunFolder(request.run), model=scene.model, model_path=file, capture=scene.capture, key="",
         name="merged" if scene.model.decoder_spans else "coarse", status=StatusRecord(state="done"), warning="",
     )  # fmt: skip
-    write_files(opened, request, _warning_console())
+    with without_autocast(scene.positions.device), stops_as_python():
+        write_files(opened, request, _warning_console())
 
 
 def train(
@@ -424,7 +440,7 @@ def train(
     *,
     run_dir: str | Path | None = None,
     callbacks: Sequence[Callable[[Any], object]] = (),
-    device: str = "cpu",
+    device: str | torch.device = "cpu",
     capture_options: CaptureOptions | None = None,
 ) -> Scene:
     """Train a scene as `vdgs run` does: global model, V, blocks, cameras, block training, merge; the same bits.
@@ -433,7 +449,8 @@ def train(
     moves between photographs is not looked for, and after every step each callback is given a `TrainingEvent` (stage,
     iteration, iterations, loss, psnr in dB, anchors); one that returns True ends the stage early. With `run_dir` it is
     a run folder, which the same call continues after a crash; its blocks train in processes of their own, so it takes
-    the capture's folder and no callbacks.
+    the capture's folder and no callbacks. Ctrl-C is KeyboardInterrupt there too, after what was done is saved.
+    Photographs with poses and without points are refused: `vdgs sfm` finds points (`vdgs run` does so by itself).
     `capture_options` say how a folder is read, and go with no `Capture`. Notes of the stages, and doubts about the
     capture, are printed on standard error. Raises CaptureError for a capture that cannot
     become a scene, VdgsError for settings, TrainingDiverged.
@@ -453,17 +470,19 @@ def train(
             "capture_options say how a folder is read, and this Capture is read already: give the folder, or the "
             "options to vdgs.load_capture"
         )
-    device = select_device(device).device
+    where = select_device(device).device
     if run_dir is None:
         if isinstance(method, MethodConfig) and method.block.mask_moving == "on":
             raise VdgsError("mask_moving='on' keeps the masks that it makes in a run folder: name one (run_dir)")
         opened = capture if isinstance(capture, Capture) else _read_capture(capture, vars(settings))
-        return Scene(train_in_memory(opened, method, callbacks, _warning_console(), device), opened)
+        with without_autocast(where):
+            return Scene(train_in_memory(opened, method, callbacks, _warning_console(), where), opened)
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
         raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
-    train_in_run_folder(home_path(capture), settings, method, home_path(run_dir), _warning_console(), device)
-    return open_run(run_dir, model="coarse" if isinstance(method, TrainConfig) else "best", device=device).scene
+    with without_autocast(where), stops_as_python():
+        train_in_run_folder(home_path(capture), settings, method, home_path(run_dir), _warning_console(), where)
+    return open_run(run_dir, model="coarse" if isinstance(method, TrainConfig) else "best", device=where).scene
 
 
 def view(run: Run | str | Path, *, host: str = "127.0.0.1", port: int | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -12,7 +13,14 @@ from torch import Tensor
 from vdgs.config.ranges import MAX_COUNT, Range
 from vdgs.config.validation_rules import checked_value
 from vdgs.errors import VdgsError, check_kind
-from vdgs.geometry.camera import Camera, CameraModel, is_rigid_motion
+from vdgs.geometry.camera import (
+    MAX_COORDINATE,
+    ROUNDING_TOLERANCE,
+    Camera,
+    CameraModel,
+    is_rigid_motion,
+    nearest_rotation,
+)
 from vdgs.model.decoder import Decoder
 
 #: What is no skew but rounding, in pixels.
@@ -55,7 +63,7 @@ def to_torch(name: str, value: Any) -> Tensor:
 
 def check_finite_points(points: Tensor) -> None:
     """Raise VdgsError for places [n, 3] that are not finite numbers."""
-    if wrong := int((~points.isfinite()).reshape(len(points), -1).any(1).sum()) if points.ndim else 0:
+    if wrong := int((~points.isfinite()).flatten(1).any(1).sum()) if points.ndim > 1 else 0:
         raise VdgsError(f"points must be finite, and {wrong} of {len(points)} are not: leave them out")
 
 
@@ -66,6 +74,12 @@ def check_image_index(image_index: Any, decoders: Iterable[Decoder], num_images:
         return None
     known = [len(each.appearance_embedding) for each in decoders if each.appearance_embedding is not None]
     return int(checked_value("image_index", image_index, Annotated[int, Range(0, min(known, default=num_images) - 1)]))
+
+
+def without_autocast(device: torch.device | str) -> AbstractContextManager[Any]:
+    """A context in which torch computes in float32 there: vdgs decides itself what is computed in what."""
+    kind = torch.device(device).type
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
 
 
 def like(given: Any, value: Any) -> Any:
@@ -85,8 +99,11 @@ def like(given: Any, value: Any) -> Any:
 def cameras_from(
     viewmats: Array, Ks: Array, width: int, height: int, *, model: CameraModel | Literal["ortho"] = "pinhole"
 ) -> list[Camera]:
-    """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3] in pixels.
-    `model` is pinhole or orthographic, which gsplat calls ortho.
+    """Cameras from camera-from-world matrices [c, 4, 4] (OpenCV axes) and intrinsics [c, 3, 3] or [3, 3].
+
+    `model` is pinhole or orthographic, which gsplat calls ortho. cx and cy are in pixels from the upper left corner; fx
+    and fy in pixels of a pinhole camera, in pixels per unit of the world of an orthographic one. Rotations that were
+    rounded (to three decimals, to float16) are replaced by the nearest ones.
 
     Raises VdgsError for what makes no camera: a pose that is no rotation and translation, intrinsics with skew or of
     another scale, a size that is no whole number. ValueError for other shapes.
@@ -103,13 +120,7 @@ def cameras_from(
         raise ValueError(
             f"viewmats must be [c, 4, 4] and Ks [c, 3, 3], not {poses.shape} and {intrinsics.shape}{remedy}"
         )
-    for index, pose in enumerate(poses):
-        if not is_rigid_motion(pose):
-            raise VdgsError(
-                f"viewmats[{index}] is no rotation and translation of finite numbers: {pose.tolist()}. It leads from "
-                "the world into the camera, and its last row is 0 0 0 1. Divide the rotation by its scale, undo a "
-                "mirroring, or transpose the matrix."
-            )
+    poses = np.stack([_rigid(f"viewmats[{index}]", pose) for index, pose in enumerate(poses)]) if len(poses) else poses
     _check_intrinsics(intrinsics)
     return [
         Camera(
@@ -118,6 +129,30 @@ def cameras_from(
         )
         for pose, K in zip(poses, np.broadcast_to(intrinsics, (len(poses), 3, 3)), strict=True)
     ]  # fmt: skip
+
+
+def _rigid(name: str, pose: np.ndarray) -> np.ndarray:
+    """A pose [4, 4] as it is, or with the nearest rotation where its own was rounded. Raises VdgsError, with the cause,
+    for what is no rotation and translation."""
+    if is_rigid_motion(pose):
+        return pose
+    rotation, finite = pose[:3, :3], np.isfinite(pose).all()
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if finite else 0.0
+    if not finite or np.abs(pose).max() > MAX_COORDINATE:
+        why = f"it holds numbers that are not finite, or above {MAX_COORDINATE:g}"
+    elif not np.allclose(pose[3], [0, 0, 0, 1]):
+        why = "its last row is not 0 0 0 1: transpose a transposed matrix, and divide one of another scale by its corner"
+    elif off > ROUNDING_TOLERANCE:
+        why = f"R times its transpose is off 1 by {off:.2g}, above {ROUNDING_TOLERANCE:g}: divide R by its scale"
+    elif np.linalg.det(rotation) < 0:
+        why = "it mirrors the world: undo the mirroring"
+    else:
+        rounded = pose.copy()
+        rounded[:3, :3] = nearest_rotation(rotation)
+        return rounded
+    raise VdgsError(
+        f"{name} is no rotation and translation ({why}): {pose.tolist()}. It leads from the world into the camera."
+    )
 
 
 def _check_intrinsics(Ks: np.ndarray) -> None:

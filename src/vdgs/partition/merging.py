@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from vdgs.model.decoder import Decoder
 from vdgs.partition.block_records import MergedBlockRecord
 from vdgs.partition.blocks import Blocks, xy_positions
 from vdgs.partition.merge_checks import AnchorOrigins
+from vdgs.system.quoting import shell_word
 from vdgs.visibility.visibility_counts import count_visibility
 
 
@@ -54,7 +56,9 @@ def merge_blocks(
         )
     missing = [index for index, model in enumerate(block_models) if model is None]
     if missing and not allow_missing:
-        raise VdgsError(_missing_message(missing))
+        raise VdgsError(
+            missing_message(missing) + "\nor merge with --allow-missing-blocks: there the coarse anchors stand in."
+        )
     coarse_owner = blocks.owner(xy_positions(coarse.anchors.positions)) if missing else None
     selected, spans, records, own_decoder = [], [], [], False
     origins = AnchorOrigins(coarse.anchors.positions, blocks)
@@ -158,10 +162,8 @@ def _decoder_bytes(decoder: Decoder) -> dict[str, tuple[tuple[int, ...], bytes]]
     return {name: (tuple(t.shape), t.detach().numpy().tobytes()) for name, t in decoder.tensors().items()}
 
 
-def _missing_message(missing: Sequence[int]) -> str:
+def missing_message(missing: Sequence[int], run: str | Path = "RUN") -> str:
+    """Which blocks are not trained, and the commands that train them."""
     which = f"block {missing[0]} is" if len(missing) == 1 else f"blocks {', '.join(map(str, missing))} are"
-    commands = "".join(f"\n  vdgs train-blocks RUN --block {index}" for index in missing)
-    return (
-        f"{which} not trained to the end. Train what is missing:{commands}\n"
-        "or merge with --allow-missing-blocks: there the coarse anchors stand in."
-    )
+    commands = "".join(f"\n  vdgs train-blocks {shell_word(run)} --block {index}" for index in missing)
+    return f"{which} not trained to the end. Train what is missing:{commands}"

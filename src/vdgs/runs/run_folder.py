@@ -151,8 +151,9 @@ class RunFolder:
             raise RunError(
                 f"{self.config_file}: other settings than this run has:\n  "
                 + "\n  ".join(changed)
-                + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again, give the old "
-                "settings to continue, or begin another run: vdgs run CAPTURE --output RUN"
+                + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again (vdgs.train has "
+                "none: delete the folder), give the old settings to continue, or begin another run: vdgs run CAPTURE "
+                "--output RUN (another run_dir)"
             )
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings

@@ -13,7 +13,14 @@ from types import ModuleType
 from typing import Any
 
 
-class CallableFolder(ModuleType):
+class _PicklableModule(ModuleType):
+    """A module of a class of its own, pickled by its name: `pickle` and `cloudpickle` know plain modules alone."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return import_module, (self.__name__,)
+
+
+class CallableFolder(_PicklableModule):
     """A folder of a package that is called as the package's function of its name."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
@@ -30,8 +37,16 @@ class CallableFolder(ModuleType):
 
         return signature(self._function)
 
+    @property
+    def __doc__(self) -> str:  # type: ignore[override]
+        """Those of the function: `help` shows what it finds here, as of a module."""
+        from inspect import getdoc
 
-class LazyPackage(ModuleType):
+        name = self.__name__.rpartition(".")[2]
+        return f"{name}{self.__signature__}\n\n{getdoc(self._function)}"
+
+
+class LazyPackage(_PicklableModule):
     """A package that loads what its stub names. Python sets each of its folders as an attribute when it imports it."""
 
     @property
@@ -42,6 +57,11 @@ class LazyPackage(ModuleType):
             found = re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)
             vars(self)["_stubbed"] = {name: module for module, name in found}
         return vars(self)["_stubbed"]
+
+    @property
+    def __all__(self) -> list[str]:
+        """What `from PACKAGE import *` brings: the public names, which loads all of them."""
+        return sorted(self._modules)
 
     def __setattr__(self, name: str, value: Any) -> None:
         if type(value) is ModuleType and self._modules.get(name, self.__name__) != self.__name__:

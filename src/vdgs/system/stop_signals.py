@@ -14,7 +14,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from vdgs.errors import Interrupted
+from vdgs.errors import Interrupted, Stopped
 
 #: Ctrl-C, what schedulers and `kill` send, and the end of a terminal or connection.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -55,6 +55,36 @@ def catch_stop_signals(*, second_interrupts: bool = False, interrupts: bool = Fa
         for number, handler in before.items():
             signal.signal(number, handler)
         _recorded.pop()
+
+
+@contextmanager
+def stops_as_python() -> Iterator[None]:
+    """Stop signals as other Python code has them: Ctrl-C is KeyboardInterrupt, whenever it comes, which no `except
+    Exception` of a caller takes for a failure; what else the caller does on a signal is done after work has ended at a
+    consistent state (nothing: the process ends by the signal)."""
+    received: list[int] = []
+    try:
+        with catch_stop_signals(interrupts=True) as requests:
+            try:
+                yield
+            finally:
+                received += requests
+    except Stopped as error:
+        _deliver(received)
+        raise KeyboardInterrupt(str(error).replace("The same command", "The same call")) from None
+    except KeyboardInterrupt:
+        _deliver(received)
+        raise
+    if received:  # in the last moments of work that had no more step to stop at
+        _deliver(received)
+        raise KeyboardInterrupt
+
+
+def _deliver(numbers: Sequence[int]) -> None:
+    """Let the handlers of the caller have the signals that ours took. Python's own of Ctrl-C raises what is raised."""
+    for number in dict.fromkeys(numbers):
+        if signal.getsignal(number) is not signal.default_int_handler:
+            signal.raise_signal(number)
 
 
 def check_stop_requested() -> None:

@@ -19,7 +19,7 @@ from vdgs.config.method import CompensationConfig, DensifyConfig
 from vdgs.config.ranges import FRACTION, Range
 from vdgs.config.type_hints import field_hints
 from vdgs.config.validation_rules import checked_settings, checked_value
-from vdgs.errors import UnsupportedOption, check_kind
+from vdgs.errors import UnsupportedOption, VdgsError, check_kind
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.training.compensation import CompensationState, close_cycle, low_visibility_mask
@@ -114,6 +114,7 @@ class CompensatedGrowth:
     ) -> None:
         """To be called after `loss.backward()`: counts, and every `refine_every` steps adds and removes Gaussians.
 
+        Raises VdgsError for an `info` without gradients, whose step had no `step_pre_backward` or no backward pass.
         Changes `params`, the states of the optimizers and `state`. `packed` is gsplat's and not used: `info` says it.
         """
         if step >= self.refine_stop_iter:
@@ -137,6 +138,11 @@ class CompensatedGrowth:
     def _count(self, n: int, state: dict[str, Any], info: Mapping[str, Any]) -> None:
         """Add what one step has drawn to the sums of the cycle."""
         means2d, radii = info["means2d"], info["radii"]
+        if means2d.grad is None:
+            raise VdgsError(
+                "info['means2d'] has no gradient: call step_pre_backward before loss.backward(), and this after it, "
+                "with the `info` of the same step"
+            )
         gradient, size = means2d.grad, means2d.new_tensor([info["width"], info["height"]])
         shown = (radii > 0).all(-1)
         if info.get("gaussian_ids") is None:

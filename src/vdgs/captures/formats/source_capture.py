@@ -18,6 +18,7 @@ from vdgs.captures.georeference import Georef
 from vdgs.captures.name_resolution import find_file, without_uri
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import ROUNDING_TOLERANCE, nearest_rotation
 from vdgs.system.quoting import shell_word
 from vdgs.system.units import first_names
 
@@ -328,7 +329,7 @@ def check_centered(center: tuple[float, float], size: tuple[int, int], file: Pat
 
 
 def to_rigid(
-    matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3, *,
+    matrix: np.ndarray, file: Path, label: str, tolerance: float = ROUNDING_TOLERANCE, *,
     remedy: str = "The file is damaged or of another convention.",
 ) -> np.ndarray:  # fmt: skip
     """A rigid motion [4, 4] float64 from one that is rigid up to rounding.
@@ -348,8 +349,7 @@ def to_rigid(
         problem = "a pose that mirrors the world"
     if problem:
         raise BadPose(f"{file}: {label} has {problem}. {remedy}")
-    left, _, right = np.linalg.svd(matrix[:3, :3])
     result = np.eye(4)
-    result[:3, :3] = left @ right
+    result[:3, :3] = nearest_rotation(matrix[:3, :3])
     result[:3, 3] = matrix[:3, 3]
     return result
