@@ -185,6 +185,13 @@ def test_axes_are_named_as_files_record_them_and_heights_only_where_the_third_go
         assert (file["heights"] is not None) == up
 
 
+@pytest.mark.parametrize("crs", [None, "local"])
+def test_only_of_a_place_on_earth_files_say_where_east_is(export, crs):
+    (placed,), (nowhere,) = export("a.ply", origin=PLACE, crs=crs)["files"], export("b.ply", crs=crs)["files"]
+    assert placed["axes"] == "x east, y north, z up"
+    assert nowhere["axes"] == "x, y, z of the ground frame (its z is up; north is not known)"
+
+
 def test_the_usual_system_is_named(export, tmp_path: Path):
     pytest.importorskip("pyproj")
     (on_map,) = export("a.points.ply", origin=PLACE, crs="EPSG:25832")["files"]

@@ -75,12 +75,16 @@ def test_a_mirrored_scene_shows_the_mirrored_picture():
 
 @pytest.mark.parametrize("axes", ALL, ids=lambda axes: axes.name)
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "a.splat"])
-def test_files_along_any_axes_are_read_back_into_the_ground_frame(tmp_path, axes: Axes, name: str):
+@pytest.mark.parametrize("has_compass", [True, False])
+def test_files_along_any_axes_are_read_back_into_the_ground_frame(tmp_path, axes: Axes, name: str, has_compass: bool):
     some = random_gaussians(300, 0 if name.endswith("splat") else 2)
-    registry.write_scene(tmp_path / name, replace(ExportScene.of(some), axes=axes))
+    scene = ExportScene.of(some, ExportMetadata(has_compass=has_compass))
+    registry.write_scene(tmp_path / name, replace(scene, axes=axes))
     back = registry.read_gaussians(tmp_path / name)
     assert psnr(picture(back), picture(some)) > 28
-    assert axes.description.encode() in b"".join(each.read_bytes()[:2000] for each in sorted(tmp_path.iterdir()))
+    written = b"".join(each.read_bytes()[:2000] for each in sorted(tmp_path.iterdir()))
+    assert axes.words(has_compass).encode() in written
+    assert (b"east" in written or b"west" in written) == has_compass
 
 
 def test_each_program_gets_its_axes_and_no_other_files(tmp_path):
@@ -427,5 +431,10 @@ def test_what_a_living_process_needs_stays(tmp_path):
 
 
 def test_the_facts_beside_a_file_say_how_it_stands(tmp_path):
-    registry.write_scene(tmp_path / "a.spz", replace(ExportScene.of(random_gaussians(20, 0)), axes=Y_UP_LEFT))
-    assert json.loads((tmp_path / "a.spz.json").read_text())["axes"] == "x east, y up, z north"
+    for has_compass, words in (
+        (True, "x east, y up, z north"),
+        (False, "x, z, y of the ground frame (its z is up; north is not known)"),
+    ):
+        scene = ExportScene.of(random_gaussians(20, 0), ExportMetadata(has_compass=has_compass))
+        registry.write_scene(tmp_path / "a.spz", replace(scene, axes=Y_UP_LEFT))
+        assert json.loads((tmp_path / "a.spz.json").read_text())["axes"] == words

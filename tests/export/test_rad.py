@@ -63,4 +63,4 @@ def test_columns_hold_the_numbers_of_the_tree(tmp_path):
     np.testing.assert_array_equal(np.frombuffer(columns["child_count"], "<u2"), wanted.counts)
     assert set(columns) >= {"sh1", "sh2"}
     assert "sh3" not in columns
-    assert json.loads((tmp_path / "a.rad.json").read_text())["axes"].startswith("x east, y up")
+    assert json.loads((tmp_path / "a.rad.json").read_text())["axes"].startswith("x, z, -y of the ground")

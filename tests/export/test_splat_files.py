@@ -25,7 +25,9 @@ from vdgs.kernels import get_backend
 from vdgs.model.gaussian_transform import gaussian_covariances
 from vdgs.model.gaussians import Gaussians
 
-PLACED = ExportMetadata(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
+PLACED = ExportMetadata(
+    origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0), has_compass=True
+)
 #: PSNR of what is read back, drawn, against the scene as it was: at least.
 CLOSE = {".ply": 100, ".spz": 38, ".splat": 38}
 

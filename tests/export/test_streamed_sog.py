@@ -65,7 +65,7 @@ def test_each_level_is_the_scene(tmp_path, flat, monkeypatch):
         for node in nodes:
             assert (node["means"].numpy() >= np.array(node["min"]) - 1e-3).all()
             assert (node["means"].numpy() <= np.array(node["max"]) + 1e-3).all()
-    assert json.loads((tmp_path / "lod-meta.json.json").read_text())["axes"].startswith("x west")
+    assert json.loads((tmp_path / "lod-meta.json.json").read_text())["axes"].startswith("-x, -z, -y of the ground")
 
 
 def test_an_earlier_one_goes_and_what_others_put_there_stays(tmp_path, flat):

@@ -5,6 +5,10 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import pickle
+import pydoc
+import shutil
+import signal
 import subprocess
 import sys
 import warnings
@@ -15,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
 
 import vdgs
 from support.captures import tiny_scene
@@ -24,8 +29,9 @@ from support.fake_device import CARD, pretended_card
 from support.small_pipeline import vdgs as verb
 from vdgs.config.presets import PRESETS
 from vdgs.config.validation_rules import checked_settings
-from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.errors import CaptureError, RunError, Stopped, VdgsError
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.system.stop_signals import catch_stop_signals
 
 pytestmark = [pytest.mark.xdist_group("api"), pytest.mark.slow]
 STUB = Path(vdgs.__file__).with_suffix(".pyi")
@@ -123,6 +129,26 @@ def test_functions_that_are_folders_too_are_both():
     for name in ("export", "partition"):
         assert callable(getattr(vdgs, name))
         assert inspect.signature(getattr(vdgs, name)) == inspect.signature(getattr(vdgs.ops.api, name))
+
+
+@pytest.mark.parametrize("module", [vdgs, vdgs.export, vdgs.partition], ids=lambda module: module.__name__)
+def test_modules_travel_to_other_processes(module):
+    """As joblib, dask and ray send functions that use them."""
+    assert pickle.loads(pickle.dumps(module)) is module  # noqa: S301
+
+
+def test_a_star_import_brings_what_is_documented():
+    found: dict = {}
+    exec("from vdgs import *", found)
+    assert {name for name in found if not name.startswith("_")} == set(vdgs._modules)
+    assert found["partition"] is vdgs.partition
+
+
+def test_help_shows_the_function_of_a_folder():
+    for name in ("export", "partition"):
+        function, shown = getattr(vdgs.ops.api, name), pydoc.plaintext.document(getattr(vdgs, name))
+        assert f"{name}{inspect.signature(function)}" in shown
+        assert inspect.getdoc(function).splitlines()[-1] in shown
 
 
 def test_a_run_is_opened_and_drawn(run, native_small):
@@ -231,7 +257,7 @@ def test_doubts_about_a_capture_are_warnings_and_what_cannot_become_a_scene_is_r
     for frame in content["frames"]:
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(CaptureError, match=r"cannot become a scene.*(?s:.)*No training camera sees"):
+    with pytest.raises(CaptureError, match=r"are not where the cameras look.*or the poses are of another convention"):
         vdgs.load_capture(tmp_path)
 
 
@@ -243,8 +269,15 @@ def test_matrices_that_make_no_camera_are_refused(run):
     scaled[:3, :3] *= 2
     skewed[0, 1], turned[1, 1] = 5, -camera.fy
     mirrored = np.diag([1.0, 1.0, -1.0, 1.0]) @ pose
-    for wrong in (np.full((4, 4), np.nan), np.full((4, 4), np.inf), scaled, mirrored, pose.T):
-        with pytest.raises(VdgsError, match=r"viewmats\[1\] is no rotation and translation"):
+    for why, wrong in (
+        ("it holds numbers that are not finite", np.full((4, 4), np.nan)),
+        ("it holds numbers that are not finite", np.full((4, 4), np.inf)),
+        ("R times its transpose is off 1 by 3,", scaled),
+        ("R times its transpose is off 1 by 0.0", np.diag([1.01, 1.01, 1.01, 1]) @ pose),
+        ("it mirrors the world", mirrored),
+        ("its last row is not 0 0 0 1: transpose", pose.T),
+    ):
+        with pytest.raises(VdgsError, match=rf"viewmats\[1\] is no rotation and translation \({why}"):
             vdgs.cameras_from(np.stack([pose, wrong]), K, 4, 3)
     for wrong in (skewed, K.T, 2 * K, turned, 0 * K, K * np.nan):
         for intrinsics in (wrong, np.stack([K, wrong])):
@@ -260,6 +293,21 @@ def test_matrices_that_make_no_camera_are_refused(run):
         vdgs.cameras_from(pose, K, 4, 3)
     made = vdgs.cameras_from(pose[None].astype(np.float32), K, np.int64(4), torch.tensor(3))[0]
     assert (made.width, made.height, type(made.width)) == (4, 3, int)
+
+
+def test_rounded_poses_become_the_nearest_rotations():
+    """Of texts with three decimals and of float16, as captures on disk are read."""
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, :3, :3] = Rotation.random(200, random_state=0).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-4, 4, (200, 3))
+    for rounded in (np.round(poses, 3), np.round(poses, 4), poses.astype(np.float16)):
+        made = vdgs.cameras_from(rounded, np.diag([50.0, 50, 1]), 64, 48)
+        found = np.stack([each.camera_from_world for each in made])
+        assert np.abs(found - poses).max() < 3e-3
+        assert np.array_equal(found[:, :3, 3], rounded[:, :3, 3].astype(float))
+        vdgs.count_visibility(poses[:, :3, 3], made)
+    assert np.array_equal(vdgs.cameras_from(poses, np.diag([50.0, 50, 1]), 64, 48)[7].camera_from_world, poses[7])
 
 
 def test_presets_are_read_as_they_are():
@@ -280,6 +328,8 @@ def test_visibility_is_counted_in_the_kind_that_is_given(coarse, native_small):
         assert found.dtype == np.int32
         assert found.tolist() == counts.tolist()
     assert isinstance(vdgs.visibility_ratio(points, coarse.cameras), np.ndarray)
+    for none in (points[:0], coarse.positions[:0]):
+        assert [len(f(none, coarse.cameras)) for f in (vdgs.count_visibility, vdgs.visibility_ratio)] == [0, 0]
 
 
 def test_the_stages_are_those_of_the_run(run, coarse):
@@ -291,6 +341,10 @@ def test_the_stages_are_those_of_the_run(run, coarse):
     assert np.array_equal(assignment.reasons, run.assignment.reasons)
     merged = vdgs.merge(coarse, run.block_scenes, blocks, assignment)
     assert same(merged, run.scene)
+    assert same(vdgs.merge(coarse, iter(run.block_scenes), blocks, assignment), run.scene)
+    other = vdgs.partition(coarse.positions.flip(1), counts, num_blocks=2)
+    with pytest.raises(VdgsError, match=r"trained for another cut of the scene.*Give the blocks and the assignment"):
+        vdgs.merge(coarse, run.block_scenes, other, assignment)
     with pytest.raises(VdgsError, match="at place 0 is of block 1: give the models in the order of the blocks"):
         vdgs.merge(coarse, run.block_scenes[::-1], blocks, assignment)
     with pytest.raises(ValueError, match=r"not \[5 training cameras, 2 blocks\]"):
@@ -315,6 +369,30 @@ def test_a_scene_on_a_card_is_merged_there(decoders, run, coarse):
 
 def with_decoder_of(model: AnchorModel, coarse: AnchorModel) -> AnchorModel:
     return replace(model, decoder=coarse.decoder, metadata=replace(model.metadata, decoder="frozen"))
+
+
+def test_a_device_may_be_one_of_torch(run):
+    for device in (torch.device("cpu"), torch.device("cpu", 0)):
+        assert vdgs.open_run(run.path, device=device).device == "cpu"
+    with pytest.raises(VdgsError, match="--device meta: choose auto, cpu, cuda"):
+        vdgs.open_run(run.path, device=torch.device("meta"))
+
+
+def test_a_block_that_is_not_trained_is_named_with_its_command(run, tmp_path):
+    shutil.copytree(run.path, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "blocks" / "01")
+    opened = vdgs.open_run(tmp_path / "run")
+    with pytest.raises(RunError, match=rf"block 1 is not trained(?s:.*)\n  vdgs train-blocks {opened.path} --block 1"):
+        opened.block_scenes  # noqa: B018
+
+
+def test_autocast_of_a_caller_changes_nothing(run, capture):
+    camera = run.scene.cameras[0]
+    config = replace(run.settings.training, iterations=2)
+    drawn, trained = vdgs.render(run.scene, camera).rgb, vdgs.train(capture, config)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(vdgs.render(run.scene, camera).rgb, drawn)
+        assert same(vdgs.train(capture, config), trained)
 
 
 def test_blocks_are_opened_on_the_device_of_the_run(run):
@@ -366,6 +444,31 @@ def test_training_in_a_folder_leaves_a_run(run, native_small, tmp_path, monkeypa
     assert len(vdgs.open_run(tmp_path / "run").blocks) == 2
     again = vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run", capture_options=options)
     assert same(again, scene)
+
+
+@pytest.mark.parametrize("signals", [[signal.SIGINT], [signal.SIGINT] * 2])
+def test_ctrl_c_while_a_run_trains_is_no_error_of_vdgs(signals, run, native_small, tmp_path, monkeypatch):
+    """A loop over captures that goes on after a VdgsError ends."""
+
+    def stages(*_args):
+        with catch_stop_signals() as asked:
+            for number in signals:
+                signal.raise_signal(number)
+            if asked:
+                raise Stopped("Stopped; saved. The same command continues.")
+
+    monkeypatch.setattr("vdgs.pipeline.train_in_memory.train_in_run_folder", stages)
+    with pytest.raises(KeyboardInterrupt, match=r"^Stopped; saved\. The same call continues\.$"):
+        vdgs.train(native_small.capture, run.settings, run_dir=tmp_path / "run")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_other_settings_of_a_run_folder_are_refused_with_what_python_has(run, native_small, tmp_path):
+    shutil.copytree(run.path, tmp_path / "run")
+    other = replace(run.settings, training=replace(run.settings.training, seed=7))
+    options = vdgs.CaptureOptions(up="z")
+    with pytest.raises(RunError, match=r"vdgs\.train has none: delete the folder(?s:.*)another run_dir"):
+        vdgs.train(native_small.capture, other, run_dir=tmp_path / "run", capture_options=options)
 
 
 def test_the_file_is_that_of_the_command_line(run, coarse, native_small, tmp_path):
@@ -423,8 +526,6 @@ def test_what_is_no_model_is_told_and_kept(run, native_small, tmp_path):
 
 
 def test_a_run_whose_capture_is_gone_is_still_drawn(run, native_small, tmp_path, monkeypatch):
-    import shutil
-
     shutil.copytree(native_small.whole, tmp_path / "run")
     config = (tmp_path / "run" / "config.yaml").read_text()
     (tmp_path / "run" / "config.yaml").write_text(config.replace(str(native_small.capture), str(tmp_path / "gone")))

@@ -13,7 +13,7 @@ import pytest
 import vdgs
 from support.commands import PATIENCE_SECONDS
 from vdgs.errors import Interrupted
-from vdgs.system.stop_signals import STOP_SIGNALS, catch_stop_signals, check_stop_requested
+from vdgs.system.stop_signals import STOP_SIGNALS, catch_stop_signals, check_stop_requested, stops_as_python
 
 #: Loads pycolmap, with or without a handler of ours, then says what SIGTERM does.
 LOADED = """
@@ -135,3 +135,40 @@ def test_outside_the_main_thread_nothing_is_noted():
     thread.start()
     thread.join()
     assert seen == [([], before)]
+
+
+def work(moment: str) -> None:
+    """Work of vdgs that Ctrl-C meets before, in, or at the end of a part that saves on it."""
+    if moment == "before":
+        signal.raise_signal(signal.SIGINT)
+    with catch_stop_signals() as asked:
+        if moment in ("within", "late"):
+            signal.raise_signal(signal.SIGINT)
+        if asked and moment == "within":
+            check_stop_requested()
+
+
+@pytest.mark.parametrize("moment", ["before", "within", "late"])
+def test_ctrl_c_is_pythons_own_whenever_it_comes(moment):
+    with pytest.raises(KeyboardInterrupt), stops_as_python():
+        work(moment)
+    with stops_as_python():
+        work("never")
+
+
+def terminated(told: list[int]) -> None:
+    with stops_as_python(), catch_stop_signals() as asked:
+        signal.raise_signal(signal.SIGTERM)
+        assert (list(asked), told) == ([signal.SIGTERM], [])
+        check_stop_requested()
+
+
+def test_other_signals_are_the_callers_after_work_has_ended():
+    told = []
+    before = signal.signal(signal.SIGTERM, lambda number, _frame: told.append(number))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            terminated(told)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert told == [signal.SIGTERM]

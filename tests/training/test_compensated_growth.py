@@ -146,6 +146,9 @@ def test_what_does_not_fit_is_said():
         CompensatedGrowth().check_sanity(params, {"means": optimizers["means"]})
     with pytest.raises(UnsupportedOption, match="absgrad"):
         CompensatedGrowth(absgrad=True).check_sanity(params, optimizers)
+    info = {"means2d": torch.zeros(1, 1, 2), "radii": torch.ones(1, 1, 2), "width": 4, "height": 4, "n_cameras": 1}
+    with pytest.raises(VdgsError, match="means2d'] has no gradient: call step_pre_backward before"):
+        CompensatedGrowth().step_post_backward(params, optimizers, CompensatedGrowth().initialize_state(), 1, info)
     del params["quats"]
     with pytest.raises(ValueError, match="params lacks quats"):
         CompensatedGrowth().check_sanity(params, optimizers)

@@ -47,7 +47,7 @@ class View:
 
     def __post_init__(self) -> None:
         for name, path in (("image_path", self.image_path), ("mask_path", self.mask_path)):
-            if not isinstance(path, Path) and (name, path) != ("mask_path", None):
+            if not isinstance(path, Path) and not (name == "mask_path" and path is None):
                 raise TypeError(
                     f"{name} must be pathlib.Path, not {type(path).__name__}: vdgs.write_capture(FOLDER, images, "
                     "cameras) writes pictures in memory as a capture"

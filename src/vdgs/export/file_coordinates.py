@@ -46,4 +46,4 @@ def coordinates_of_file(path: Path, frame: LocalFrame, request: ExportRequest) -
         return FileCoordinates(ON_GLOBE, EARTH_CENTERED.description, None, frame.notes)
     axes = axes_of_file(path, frame, request)
     heights = frame.height_reference if axes is Z_UP else None
-    return FileCoordinates(frame.name, axes.description, heights, frame.notes)
+    return FileCoordinates(frame.name, axes.words(frame.facts.has_compass), heights, frame.notes)

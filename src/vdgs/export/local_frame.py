@@ -128,11 +128,14 @@ def make_local_frame(
         rotation, translation = turn @ similarity.rotation, turn @ (similarity.translation - origin)
         about = replace(ground, origin_geo=geodetic)
         named = MapProjection.of(about, "enu")
+        facts = ExportMetadata(unit=unit, geodetic=geodetic, has_compass=True)
         return LocalFrame(
-            similarity.scale, rotation, translation, ExportMetadata(unit=unit, geodetic=geodetic), None, named.name,
-            named.height_reference,
+            similarity.scale, rotation, translation, facts, None, named.name, named.height_reference,
         )  # fmt: skip
-    facts = ExportMetadata((float(origin[0]), float(origin[1]), float(origin[2])), placement.wkt, unit)
+    facts = ExportMetadata(
+        (float(origin[0]), float(origin[1]), float(origin[2])), placement.wkt, unit,
+        has_compass=placement.wkt is not None or ground.origin_geo is not None,
+    )  # fmt: skip
     curved = placement if placement.wkt is not None else None
     return LocalFrame(
         similarity.scale, similarity.rotation, similarity.translation - origin, facts, curved, placement.name,

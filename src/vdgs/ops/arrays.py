@@ -141,7 +141,7 @@ def _rigid(name: str, pose: np.ndarray) -> np.ndarray:
     if not finite or np.abs(pose).max() > MAX_COORDINATE:
         why = f"it holds numbers that are not finite, or above {MAX_COORDINATE:g}"
     elif not np.allclose(pose[3], [0, 0, 0, 1]):
-        why = "its last row is not 0 0 0 1: transpose a transposed matrix, and divide one of another scale by its corner"
+        why = "its last row is not 0 0 0 1: transpose a transposed matrix, divide one of another scale by its corner"
     elif off > ROUNDING_TOLERANCE:
         why = f"R times its transpose is off 1 by {off:.2g}, above {ROUNDING_TOLERANCE:g}: divide R by its scale"
     elif np.linalg.det(rotation) < 0:

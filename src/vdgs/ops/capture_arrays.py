@@ -50,7 +50,8 @@ def write_capture(
     in that world that pictures show, which a scene starts from, `point_colors` [n, 3] uint8; without points the folder
     still needs `vdgs sfm FOLDER --output CAPTURE`, which finds them. `masks` [h, w] bool (or uint8: kept from 128 up)
     keep what is true; None keeps all of a picture. `names` are those of the files, relative and ending in .png;
-    pictures are used in the order of their names. Pictures are PNG, pixel by pixel those that were given.
+    pictures are used in the order of their names. Pictures are PNG, pixel by pixel those that were given. Needs
+    pycolmap.
 
     Replaces a capture that it wrote, at the end and as a whole. Raises VdgsError for a folder that holds anything else,
     for cameras that are not pinhole ones, for points that are not finite and for names that are no file's; ValueError
@@ -130,7 +131,7 @@ def _uint8(name: str, value: Any) -> np.ndarray:
     check_kind(name, value, np.ndarray, Tensor)
     array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
     if array.dtype != np.uint8:
-        raise TypeError(f"{name} must be uint8, 0 to 255, not {array.dtype}: of 0 to 1 give np.uint8(np.round(255 * x))")
+        raise TypeError(f"{name} must be uint8, 0 to 255, not {array.dtype}: of 0 to 1 give np.uint8(255 * x + 0.5)")
     return array
 
 
@@ -138,12 +139,14 @@ def _write_pictures(
     root: Path, files: list[str], images: Iterable[Array], cameras: Sequence[Camera],
     masks: Iterable[Array | None] | None,
 ) -> None:  # fmt: skip
-    end = object()
+    end: Any = object()
     kept: Iterable[Any] = [None] * len(files) if masks is None else masks
-    for index, (image, mask, name, camera) in enumerate(zip_longest(images, kept, files, cameras, fillvalue=end)):
+    rows: Iterable[tuple[Any, Any, Any, Any]] = zip_longest(images, kept, files, cameras, fillvalue=end)
+    for index, (image, mask, name, camera) in enumerate(rows):
         if any(each is end for each in (image, mask, name)):
             raise ValueError(f"there must be an image (and a mask, or None) for each of the {len(files)} cameras")
-        pixels, size = _uint8(f"images[{index}]", image), (camera.height, camera.width)
+        pixels = _uint8(f"images[{index}]", image)
+        size: tuple[int, int] = (camera.height, camera.width)
         if pixels.shape != (*size, 3):
             raise ValueError(f"images[{index}] must be {[*size, 3]}, as its camera, not {list(pixels.shape)}")
         if min(size) < MIN_SIDE_PX:

@@ -25,10 +25,20 @@ class Axes:
     """What the coordinates of a file mean."""
 
     name: str
-    #: As files say it.
+    #: As files of scenes with a place on Earth say it.
     description: str
     #: From the ground frame (x east, y north, z up) to these axes: a rotation, or one with a reflection.
     turn: Float[np.ndarray, "3 3"]
+
+    @property
+    def without_compass(self) -> str:
+        """As files of other scenes say it, which know up alone: the axes of the ground frame that x, y and z are."""
+        along = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in self.turn]
+        return f"{', '.join(along)} of the ground frame (its z is up; north is not known)"
+
+    def words(self, has_compass: bool) -> str:
+        """What a file says of its axes."""
+        return self.description if has_compass or self is EARTH_CENTERED else self.without_compass
 
     def of_ground(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians of the ground frame along these axes."""
@@ -76,7 +86,7 @@ def _mirrored(gaussians: Gaussians) -> Gaussians:
 
 def axes_named(words: object, usual: Axes) -> Axes:
     """The axes that a file describes by these words; the usual ones of its format where it says nothing."""
-    return next((axes for axes in ALL if axes.description == words), usual)
+    return next((axes for axes in ALL if words in (axes.description, axes.without_compass)), usual)
 
 
 def axes_beside(path: Path, usual: Axes) -> Axes:

@@ -42,12 +42,14 @@ class ExportMetadata:
     unit: str = "metre"
     #: Latitude and longitude (deg) and ellipsoidal height (m) of the local origin; x is then east, y north, z up.
     geodetic: tuple[float, float, float] | None = None
+    #: Whether x is east and y north, in any of these systems; else the scene has no place on Earth.
+    has_compass: bool = False
     #: Who wrote the file.
     program: str = f"vdgs {__version__}"
 
     def to_dict(self) -> dict[str, object]:
-        """JSON-able, without what is not known."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        """JSON-able, without what is not known, and without what the words on the axes say."""
+        return {name: value for name, value in asdict(self).items() if value is not None and name != "has_compass"}
 
 
 @dataclass(frozen=True)
@@ -176,4 +178,4 @@ def metadata_path(path: Path) -> Path:
 
 def write_metadata_file(path: Path, metadata: ExportMetadata, axes: Axes) -> None:
     """Write the facts beside a file, with what its axes mean."""
-    write_json(metadata_path(path), {"file": path.name, **metadata.to_dict(), "axes": axes.description})
+    write_json(metadata_path(path), {"file": path.name, **metadata.to_dict(), "axes": axes.words(metadata.has_compass)})

@@ -43,7 +43,7 @@ def property_names(degree: int) -> tuple[str, ...]:
 
 def header_comments(scene: ExportScene, axes: Axes) -> list[str]:
     """Header lines that say where local coordinates stand, one fact each, as JSON, none of them long."""
-    known = {**scene.metadata.to_dict(), "axes": axes.description}
+    known = {**scene.metadata.to_dict(), "axes": axes.words(scene.metadata.has_compass)}
     if scene.metadata.crs is not None:
         known["crs"] = short_name(scene.metadata.crs)
     lines = [f"comment {name} {header_line(value if isinstance(value, str) else json.dumps(value))[:LONGEST_COMMENT]}"

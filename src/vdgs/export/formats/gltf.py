@@ -153,7 +153,8 @@ def _document(
 
 def asset_json(metadata: ExportMetadata) -> JsonObject:
     """glTF's and 3D Tiles' word on where a file comes from."""
-    return {"version": "2.0", "generator": metadata.program, "extras": {**metadata.to_dict(), "axes": Y_UP.description}}
+    axes = Y_UP.words(metadata.has_compass)
+    return {"version": "2.0", "generator": metadata.program, "extras": {**metadata.to_dict(), "axes": axes}}
 
 
 def spz_glb(gaussians: Gaussians, spz: bytes, translation: np.ndarray, metadata: ExportMetadata) -> bytes:

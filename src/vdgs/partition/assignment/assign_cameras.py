@@ -90,7 +90,9 @@ def _warnings(scores: ScoreMatrix, reasons: np.ndarray, threshold: float, always
     for block, anchors in enumerate(scores.anchors):
         watching = int(np.count_nonzero(scores.visible_anchors[:, block]))
         if anchors == 0:
-            warnings.append(f"Block {block} holds no anchors. Cut the scene into fewer blocks: --blocks (num_blocks in Python).")
+            warnings.append(
+                f"Block {block} holds no anchors. Cut the scene into fewer blocks: --blocks (num_blocks in Python)."
+            )
         elif watching == 0:
             warnings.append(
                 f"Block {block}: no training camera sees any of its {anchors:,} anchors. It cannot be trained; the "
