@@ -392,6 +392,10 @@ def test_autocast_of_a_caller_changes_nothing(run, capture):
     drawn, trained = vdgs.render(run.scene, camera).rgb, vdgs.train(capture, config)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(vdgs.render(run.scene, camera).rgb, drawn)
+        assert (
+            vdgs.ops.decode_anchors(run.scene.model.anchors, run.scene.model.decoder, camera).colors.dtype
+            == torch.float32
+        )
         assert same(vdgs.train(capture, config), trained)
 
 

@@ -17,7 +17,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.renderer import cull_anchors
 from vdgs.model.renderer import decode_anchors as decode_rows
-from vdgs.ops.arrays import Array, check_image_index, in_place, like, to_torch
+from vdgs.ops.arrays import Array, check_image_index, in_place, like, to_torch, without_autocast
 
 _AT_LEAST_0 = Annotated[float, Range(0, MAX_FLOAT)]
 
@@ -47,7 +47,8 @@ def decode_anchors(
     check_camera("camera", camera)
     rows = cull_anchors(anchors, camera) if rows is None else to_torch("rows", rows)
     weights = decoder.weights_for_image(check_image_index(image_index, [decoder]))
-    return decode_rows(anchors, rows, weights, camera)
+    with without_autocast(anchors.positions.device):
+        return decode_rows(anchors, rows, weights, camera)
 
 
 class Projection(NamedTuple, Generic[Array]):

@@ -51,11 +51,14 @@ class AnchorOrigins:
         self._given[found[known]] = True
 
     def check(self, rule: str) -> None:
-        """Raise VdgsError where a block was trained for another cut, or where anchors of trained blocks would be lost.
+        """Raise VdgsError where anchors of trained blocks would be lost: of another cut, or by the rule.
 
         Where no position is in two models the margins were frozen: then the block that a position is given to has it,
         unless training has removed it everywhere. With other margins a neighbor may still hold what the owner removed.
         """
+        lost = np.flatnonzero((self._holders > 0) & ~self._given)
+        if not len(lost):
+            return
         for index, (total, outside) in self._counts.items():
             if outside:
                 raise VdgsError(
@@ -63,9 +66,6 @@ class AnchorOrigins:
                     f"anchors in its model lie outside of the widened block. {_REMEDY}"
                 )
         if (self._holders > 1).any():
-            return
-        lost = np.flatnonzero((self._holders > 0) & ~self._given)
-        if not len(lost):
             return
         if rule != "owner" and self._owner_holds[lost].all():  # the rule gives them to others
             if self._has_rings:
@@ -90,8 +90,7 @@ class AnchorOrigins:
 
 
 _REMEDY = (
-    "Give the blocks and the assignment that they were trained with (.blocks and .assignment of vdgs.open_run(RUN)), "
-    "or train them for this cut: vdgs train-blocks RUN"
+    "Give the blocks and the assignment that they were trained with: .blocks and .assignment of vdgs.open_run(RUN)"
 )
 
 
