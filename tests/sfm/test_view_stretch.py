@@ -23,7 +23,16 @@ from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import attitude_from_gimbal
-from vdgs.sfm.incremental_mapper import ASKED, OF_HEIGHTS, OF_PARALLEL, OF_SHAPE, release_focal
+from vdgs.sfm.incremental_mapper import (
+    ASKED,
+    OF_HEIGHTS,
+    OF_LENSES,
+    OF_ONE_HEIGHT,
+    OF_PARALLEL,
+    OF_SHAPE,
+    adjust,
+    release_focal,
+)
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reconstruction_report import _advice, _flown_heights, _relief_explains, focal_reason
 from vdgs.sfm.view_stretch import SAID_SHARE, Known, Stretch, factor_of_heights, stretched, with_stretch
@@ -111,6 +120,36 @@ def group_of(focal_px: float) -> CameraGroup:
         camera="", width=WIDTH, height=HEIGHT, focal_px=focal_px, has_focal_prior=True, source="", images=(),
         is_confirmed=True,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(("oblique", "is_held"), [(0, True), (2, True), (3, False)])
+def test_a_few_oblique_views_from_one_height_release_the_focal_length(oblique, is_held):
+    places = np.array([(x, y, 60.0 + 0.3 * math.sin(x)) for y in (-36, -12, 12, 36) for x in np.linspace(-45, 45, 6)])
+    models = [flown(places, 0.5, 1.03, oblique)[0]]
+    held = release_focal(models, (True, OF_ONE_HEIGHT), [group_of(1.03 * FOCAL)], 1)
+    assert held == ((True, OF_ONE_HEIGHT) if is_held else (False, OF_SHAPE))
+    focal = models[0].cameras[1].mean_focal_length()
+    assert focal == pytest.approx((1.03 if is_held else 1.0) * FOCAL, rel=0.004)
+
+
+def test_lenses_whose_tags_disagree_are_fitted_and_recorded_heights_tell_how_long_they_are():
+    """Held, no factor for both would bring photographs through either to their recorded heights."""
+    places, focals, said = two_heights(), (1000.0, 1500.0), (1.025, 0.985)
+    model, photographs = flown(places, 0.5, 1.0, focals=focals)
+    for number, (focal, factor) in enumerate(zip(focals, said, strict=True), 1):
+        model.cameras[number].focal_length = focal * factor
+    for k, photo in enumerate(photographs):
+        photo.lens = Lens(said[k % 2] * focals[k % 2] / WIDTH, "EXIF's focal length and sensor", confirmed=True)
+    adjust(model, 1, hold_focal=True)
+    models = [model]
+    groups = [group_of(focal * factor) for focal, factor in zip(focals, said, strict=True)]
+    held = release_focal(models, (True, OF_HEIGHTS), groups, 1)
+    assert held == (False, OF_LENSES)
+    found = placed(models[0], photographs, places, held[1], held=False)
+    for number, focal in enumerate(focals, 1):
+        assert found.model.cameras[number].mean_focal_length() == pytest.approx(focal, rel=0.005)
+    assert found.placed.inliers.all()
+    assert abs(ground_m(found)) < min(0.5, found.placed.accuracy.place_m[1])
 
 
 def test_heights_that_are_stated_to_be_worse_do_not_tell_the_focal_length_as_well():
