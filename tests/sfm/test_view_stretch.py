@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -10,20 +11,31 @@ import numpy as np
 import pytest
 
 from support.flown_models import FOCAL, HEIGHT, WIDTH, flown_model
-from vdgs.captures.reconstruction import OVER_GROUND, OVER_MEDIAN
+from vdgs.captures.reconstruction import OVER_GROUND, OVER_MEDIAN, AccuracyFacts
 from vdgs.config.sfm_options import SfmOptions
+from vdgs.geometry.similarity import Similarity
 from vdgs.sfm import incremental_mapper
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.focal_information import focal_deviation
 from vdgs.sfm.focal_length import Lens
 from vdgs.sfm.georeferencing import Georeferenced, georeference
+from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import attitude_from_gimbal
-from vdgs.sfm.incremental_mapper import ASKED, OF_HEIGHTS, OF_PARALLEL, OF_SHAPE, release_focal
+from vdgs.sfm.incremental_mapper import (
+    ASKED,
+    OF_HEIGHTS,
+    OF_LENSES,
+    OF_ONE_HEIGHT,
+    OF_PARALLEL,
+    OF_SHAPE,
+    adjust,
+    release_focal,
+)
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reconstruction_report import _advice, _flown_heights, _relief_explains, focal_reason
-from vdgs.sfm.view_stretch import SAID_SHARE, Known, Stretch, factor_of_heights, stretched
+from vdgs.sfm.view_stretch import SAID_SHARE, Known, Stretch, factor_of_heights, stretched, with_stretch
 from vdgs.system.lazy_pycolmap import pycolmap
 
 pytestmark = pytest.mark.slow
@@ -41,36 +53,44 @@ def one_height() -> np.ndarray:
 
 
 def flown(
-    places: np.ndarray, sway_deg: float = 0.0, said: float = 1.0
+    places: np.ndarray, sway_deg: float = 0.0, said: float = 1.0, oblique: int = 0, focals: Sequence[float] = (FOCAL,)
 ) -> tuple[pycolmap.Reconstruction, list[SimpleNamespace]]:
-    """A model as it is mapped with the focal length held at so many times the true one, which tags say."""
+    """A model as it is mapped with the focal length held at so many times the true one, which tags say; the first so
+    many photographs are oblique views."""
     rng = np.random.default_rng(1)
     attitudes = [
-        attitude_from_gimbal(90.0 if k % 12 < 6 else 270.0, -90.0 + rng.normal(0, sway_deg), rng.normal(0, sway_deg))
+        attitude_from_gimbal(
+            90.0 if k % 12 < 6 else 270.0,
+            (-55.0 if k < oblique else -90.0) + rng.normal(0, sway_deg),
+            rng.normal(0, sway_deg),
+        )
         for k in range(len(places))
     ]
-    model, photographs = flown_model(places, rng, attitudes=attitudes)
-    for photo in photographs:
-        photo.lens = Lens(said * FOCAL / WIDTH, "EXIF's focal length and sensor", confirmed=True)
+    model, photographs = flown_model(places, rng, attitudes=attitudes, focals=focals)
+    for k, photo in enumerate(photographs):
+        photo.lens = Lens(said * focals[k % len(focals)] / WIDTH, "EXIF's focal length and sensor", confirmed=True)
     down = np.array([0.0, 0.0, -1.0])
     return stretched(model, Stretch(down, math.log(said), 0.0, ""), 1), photographs
 
 
 def placed(
-    model: pycolmap.Reconstruction, photographs: list[SimpleNamespace], places: np.ndarray, why: str = OF_PARALLEL
-) -> Georeferenced:
-    """By positions good to a centimetre."""
+    model: pycolmap.Reconstruction, photographs: list[SimpleNamespace], places: np.ndarray, why: str = OF_PARALLEL,
+    stated: np.ndarray | None = None, held: bool = True,
+) -> Georeferenced:  # fmt: skip
+    """By positions good to a centimetre, or to what is stated."""
     count = len(places)
     positions = GpsPriors(
         image_indices=np.arange(count), enu=places + np.random.default_rng(2).normal(0, 0.01, (count, 3)),
-        gps_std=np.full((count, 3), 2.0), origin=(50.0, 8.0, 0.0), altitude_reference="", source="EXIF", notes=(),
-        flights=(places[:, 2] > 70).astype(int),
+        gps_std=np.full((count, 3), 2.0) if stated is None else stated,
+        are_stated=np.full(count, stated is not None), origin=(50.0, 8.0, 0.0), altitude_reference="", source="EXIF",
+        notes=(),
+        flights=(places[:, 2] > 70).astype(int) if stated is None else np.zeros(count, int),
     )  # fmt: skip
     plan = ReconstructionPlan(
         request=SimpleNamespace(options=SfmOptions(), gps=None), image_list=ImageList((), tuple(photographs), (), 0),
         gps_priors=positions, preflight=SimpleNamespace(height_m=None), threads=1, pairs=0,
     )  # fmt: skip
-    return georeference(model, plan, (True, why))
+    return georeference(model, plan, (held, why))
 
 
 def ground_m(found: Georeferenced) -> float:
@@ -89,14 +109,76 @@ def test_how_far_views_differ_says_how_well_photographs_tell_the_focal_length():
 @pytest.mark.parametrize(("sway_deg", "held"), [(0.0, (True, OF_PARALLEL)), (6.0, (False, OF_SHAPE))])
 def test_heights_release_no_focal_length_of_parallel_views(sway_deg, held):
     model, _ = flown(two_heights(), sway_deg, 1.03)
-    group = CameraGroup(
-        camera="", width=WIDTH, height=HEIGHT, focal_px=1.03 * FOCAL, has_focal_prior=True, source="", images=(),
-        is_confirmed=True,
-    )  # fmt: skip
     models = [model]
-    assert release_focal(models, (True, OF_HEIGHTS), [group], 1) == held
+    assert release_focal(models, (True, OF_HEIGHTS), [group_of(1.03 * FOCAL)], 1) == held
     focal = models[0].cameras[1].mean_focal_length()
     assert focal == pytest.approx(1.03 * FOCAL if held[0] else FOCAL, rel=0.01)
+
+
+def group_of(focal_px: float) -> CameraGroup:
+    return CameraGroup(
+        camera="", width=WIDTH, height=HEIGHT, focal_px=focal_px, has_focal_prior=True, source="", images=(),
+        is_confirmed=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("oblique", "is_held"), [(0, True), (2, True), (3, False)])
+def test_a_few_oblique_views_from_one_height_release_the_focal_length(oblique, is_held):
+    places = np.array([(x, y, 60.0 + 0.3 * math.sin(x)) for y in (-36, -12, 12, 36) for x in np.linspace(-45, 45, 6)])
+    models = [flown(places, 0.5, 1.03, oblique)[0]]
+    held = release_focal(models, (True, OF_ONE_HEIGHT), [group_of(1.03 * FOCAL)], 1)
+    assert held == ((True, OF_ONE_HEIGHT) if is_held else (False, OF_SHAPE))
+    focal = models[0].cameras[1].mean_focal_length()
+    assert focal == pytest.approx((1.03 if is_held else 1.0) * FOCAL, rel=0.004)
+
+
+def test_lenses_whose_tags_disagree_are_fitted_and_recorded_heights_tell_how_long_they_are():
+    """Held, no factor for both would bring photographs through either to their recorded heights."""
+    places, focals, said = two_heights(), (1000.0, 1500.0), (1.025, 0.985)
+    model, photographs = flown(places, 0.5, 1.0, focals=focals)
+    for number, (focal, factor) in enumerate(zip(focals, said, strict=True), 1):
+        model.cameras[number].focal_length = focal * factor
+    for k, photo in enumerate(photographs):
+        photo.lens = Lens(said[k % 2] * focals[k % 2] / WIDTH, "EXIF's focal length and sensor", confirmed=True)
+    adjust(model, 1, hold_focal=True)
+    models = [model]
+    groups = [group_of(focal * factor) for focal, factor in zip(focals, said, strict=True)]
+    held = release_focal(models, (True, OF_HEIGHTS), groups, 1)
+    assert held == (False, OF_LENSES)
+    found = placed(models[0], photographs, places, held[1], held=False)
+    for number, focal in enumerate(focals, 1):
+        assert found.model.cameras[number].mean_focal_length() == pytest.approx(focal, rel=0.005)
+    assert found.placed.inliers.all()
+    assert abs(ground_m(found)) < min(0.5, found.placed.accuracy.place_m[1])
+
+
+def test_heights_that_are_stated_to_be_worse_do_not_tell_the_focal_length_as_well():
+    """Above, the receiver has lost its corrections, says so, and is off by 1.5 m."""
+    places = two_heights()
+    above = places[:, 2] > 70
+    model, photographs = flown(places)
+    recorded = places + above[:, None] * [0, 0, 1.5]
+    stated = np.where(above[:, None], [0.5, 0.5, 1.0], [0.015, 0.015, 0.03])
+    found = placed(model, photographs, recorded, stated=stated)
+    assert found.model.cameras[1].mean_focal_length() == pytest.approx(FOCAL, rel=0.02)
+    assert abs(ground_m(found)) < found.placed.accuracy.place_m[1]
+
+
+def test_what_parallel_views_of_a_wall_leave_open_is_how_far_it_is():
+    model, _ = flown(one_height())
+    accuracy = AccuracyFacts(
+        place_m=(0.04, 0.06), scale_percent=0.1, scale_m=0.1, north_deg=0.1, level_deg=0.1, positions_m=None,
+        altitude="used",
+    )  # fmt: skip
+    northwards = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    none = np.zeros((0, 3))
+    lies = Georegistration(
+        similarity=Similarity(1.0, northwards, np.zeros(3)), method="", position_rows=np.zeros(0, int), targets=none,
+        residuals=none, inliers=np.zeros(0, bool), accuracy=accuracy,
+    )  # fmt: skip
+    found = with_stretch(lies, Stretch(np.array([0.0, 0, -1]), 0.0, SAID_SHARE, "tags"), model)
+    assert found.accuracy.place_m == pytest.approx((2 * SAID_SHARE * 60, 0.06), rel=0.1)
+    assert any("what they show may lie" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("said", [1.0, 1.03, 1.1])

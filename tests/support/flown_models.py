@@ -15,16 +15,19 @@ WIDTH, HEIGHT, FOCAL = 1600, 1200, 1300.0
 
 
 def flown_model(
-    places: np.ndarray, rng: np.random.Generator, bowl: float = 0.0, attitudes: Sequence[Attitude] | None = None
-) -> tuple[pycolmap.Reconstruction, list[SimpleNamespace]]:
+    places: np.ndarray, rng: np.random.Generator, bowl: float = 0.0, attitudes: Sequence[Attitude] | None = None,
+    focals: Sequence[float] = (FOCAL,),
+) -> tuple[pycolmap.Reconstruction, list[SimpleNamespace]]:  # fmt: skip
     """A model of cameras at places [n, 3] over points about height 0, marks off by half a pixel, and photographs with
     the attitudes that a drone records; `true_rotation` is camera_from_enu. Away from the origin the model rises as a
-    bowl, by so much times the distance squared. `attitudes` are the cameras', by default eastwards to a degree."""
+    bowl, by so much times the distance squared. `attitudes` are the cameras', by default eastwards to a degree.
+    Lenses of `focals` (pixels) take turns."""
     model, ground = pycolmap.Reconstruction(), _ground(places, rng)
-    camera = pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2, 0.0], camera_id=1
-    )
-    model.add_camera_with_trivial_rig(camera)
+    for number, focal in enumerate(focals, 1):
+        params = [focal, WIDTH / 2, HEIGHT / 2, 0.0]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params, camera_id=number)
+        )
     seen: list[list[tuple[int, int]]] = [[] for _ in ground]
     photographs = []
     for number, place in enumerate(places, 1):
@@ -32,7 +35,8 @@ def flown_model(
         attitude = drawn if attitudes is None else attitudes[number - 1]
         rotation = attitude.camera_from_enu
         rays = (ground - place) @ rotation.T
-        pixels = FOCAL * rays[:, :2] / rays[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        lens = (number - 1) % len(focals)
+        pixels = focals[lens] * rays[:, :2] / rays[:, 2:] + [WIDTH / 2, HEIGHT / 2]
         shown = np.flatnonzero((rays[:, 2] > 1) & (pixels > 0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1))
         for mark, point in enumerate(shown.tolist()):
             seen[point].append((number, mark))
@@ -40,7 +44,7 @@ def flown_model(
         marks = pixels[shown] + rng.normal(0, 0.5, (len(shown), 2))
         bent = rotation @ Rotation.from_rotvec([2 * bowl * place[1], -2 * bowl * place[0], 0]).as_matrix().T
         model.add_image_with_trivial_frame(
-            pycolmap.Image(name=name, keypoints=marks, camera_id=1, image_id=number),
+            pycolmap.Image(name=name, keypoints=marks, camera_id=lens + 1, image_id=number),
             pycolmap.Rigid3d(np.column_stack([bent, -bent @ _risen(place, bowl)])),
         )
         photographs.append(

@@ -24,6 +24,7 @@ from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.height_units import GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M, of_gps, with_height_unit
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.incremental_mapper import OF_LENSES
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale
@@ -87,7 +88,7 @@ def georeference(model: pycolmap.Reconstruction, prepared: ReconstructionPlan, h
         if isinstance(placed, Georegistration):
             placed = with_stretch(placed, stretch, model)
             georegistration.transform_model(model, placed.similarity)
-            model, placed = _bent(model, placed, prepared, held[0] or stretch is not None)
+            model, placed = _bent(model, placed, prepared, held[0] or (stretch is not None and held[1] != OF_LENSES))
     if isinstance(placed, AlignmentFailure):
         return Georeferenced(model, _upright(model, photographs, placed), None, (), control, photographs, notes)
     survey: tuple[GcpReport, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections import Counter
@@ -33,6 +34,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 #: So many oblique views let a flight tell the focal length. Heights that differ by so much of the flying height are
 #: several (choice).
 MIN_OBLIQUE_SHARE, MIN_HEIGHT_SPREAD = 0.15, 0.2
+#: Fewer oblique views than this may be an accident, as at take-off (choice).
+LEAST_OBLIQUE = 3
 #: So many positions and more tell the slope that a flight follows (choice).
 MIN_FOR_SLOPE = 8
 #: Steeper than this (tangent) no flight follows the ground (choice).
@@ -42,8 +45,11 @@ OF_FLIGHTS = "each flight is level within the errors of altitudes; the model wil
 OF_SLOPE = "one height over a slope, or a climb over level ground; the model will show which"
 OF_LINE = "along one line, which cannot tell it while views are parallel; the model will show whether they are"
 OF_HEIGHTS = "several heights, straight down as recorded, which parallel views cannot tell from another focal length"
+OF_ONE_HEIGHT = "one height, straight down as far as known: the flight cannot tell it"
+OF_STRIPS = "level strips over an area: the flight cannot tell it, if it looked straight down"
 #: Why it is fitted or stays held then.
 OF_SHAPE = "views of several directions, as the photographs themselves show, which tell it"
+OF_LENSES = "several lenses, whose proportion the photographs tell, not how long all of them are"
 OF_PARALLEL = "several heights, but views so parallel that the photographs cannot tell it"
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
 ASKED = "asked for"
@@ -126,7 +132,7 @@ def _by_flight(photographs: Sequence[ImageMetadata], bent: bool) -> tuple[bool, 
                 return True, OF_HEIGHTS
             return False, "flown at several heights; nothing says that all views were parallel"
     if 2 * max(len(tilts), len(heights)) >= len(photographs):
-        return True, "one height, straight down as far as known: the flight cannot tell it"
+        return True, OF_ONE_HEIGHT
     return None
 
 
@@ -135,7 +141,7 @@ def _by_positions(positions: GpsPriors, bent: bool) -> tuple[bool, str] | None:
     if not bent and _is_line(positions):
         return True, OF_LINE
     if _is_survey_grid(positions):
-        return True, "level strips over an area: the flight cannot tell it, if it looked straight down"
+        return True, OF_STRIPS
     if bent or not positions.usable or len(positions.flights) != len(positions):
         return None
     level = positions.enu - _of_flights(positions.enu[:, 2], positions.flights)[:, None] * [0, 0, 1]
@@ -166,33 +172,46 @@ def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np
 def release_focal(
     models: list[pycolmap.Reconstruction], held: tuple[bool, str], groups: Sequence[CameraGroup], threads: int
 ) -> tuple[bool, str]:
-    """Fit the focal length of the first of models, held for OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE or OF_LINE, where the
-    photographs alone tell it, unless it goes astray. Whether it is held then, and why. Several heights let
-    photographs tell it only as far as views differ in direction (`focal_deviation`)."""
-    if not held[0] or held[1] not in (OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE, OF_LINE):
+    """Fit the focal length of the first of models, held for OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE, OF_LINE, OF_ONE_HEIGHT
+    or OF_STRIPS, where the photographs alone tell it, unless it goes astray. Whether it is held then, and why. Several
+    heights let photographs tell it only as far as views differ in direction (`focal_deviation`), and a few oblique
+    views from one height do, too. Held lenses whose tags disagree would bend a model, from several heights."""
+    if not held[0] or held[1] not in (OF_FLIGHTS, OF_HEIGHTS, OF_SLOPE, OF_LINE, OF_ONE_HEIGHT, OF_STRIPS):
         return held
     model = models[0]
-    images = [image for image in placed_images(model) if image.num_points3D]
-    heights = np.array([height_over_points(image, model) for image in images])
-    views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
-    ahead = np.median(views, axis=0) / np.linalg.norm(np.median(views, axis=0))
-    oblique = np.mean(views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG)))
-    is_flat = _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights) and oblique < MIN_OBLIQUE_SHARE
-    if is_flat and held[1] != OF_LINE:
-        return True, "level strips, as the photographs themselves show, whatever their altitudes say"
-    as_held = pycolmap.Reconstruction(model)
+    oblique, few, is_level = _looks_of(model)
+    is_flat, as_held = few and is_level, pycolmap.Reconstruction(model)
     as_held.update_point_3d_errors()
-    if not is_flat and oblique < MIN_OBLIQUE_SHARE and focal_deviation(as_held) > TOLD_SHARE:
+    left_open = focal_deviation(as_held) if oblique >= LEAST_OBLIQUE or not is_flat else math.inf
+    is_told = left_open <= TOLD_SHARE and oblique >= LEAST_OBLIQUE
+    if held[1] in (OF_ONE_HEIGHT, OF_STRIPS) and not is_told:
+        return held
+    if is_flat and held[1] != OF_LINE and not is_told:
+        return True, "level strips, as the photographs themselves show, whatever their altitudes say"
+    is_open = few and not is_flat and left_open > TOLD_SHARE
+    lenses = {image.camera_id for image in placed_images(model)}
+    if is_open and (len(lenses) == 1 or not math.isfinite(left_open)):
         return True, OF_PARALLEL
     fit_focal(model, threads)
     best = (1 - NEARER_ON_LINE) * mean_reprojection_error(as_held)
-    if is_flat and mean_reprojection_error(model) >= best:  # views that roll and pitch would tell it
+    if is_flat and not is_told and mean_reprojection_error(model) >= best:  # views that roll and pitch would tell it
         models[0] = as_held
         return True, "one line of parallel views, as the photographs themselves show: they cannot tell it"
     if is_astray(model, (False, OF_SHAPE), groups) and is_held_as_good([as_held], models):
         models[0] = as_held
         return True, CONFIRMED
-    return False, OF_SHAPE
+    return False, OF_LENSES if is_open else OF_SHAPE
+
+
+def _looks_of(model: pycolmap.Reconstruction) -> tuple[int, bool, bool]:
+    """How many views of a model are oblique, whether they are few, and whether all are of one height."""
+    images = [image for image in placed_images(model) if image.num_points3D]
+    heights = np.array([height_over_points(image, model) for image in images])
+    views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
+    ahead = np.median(views, axis=0) / np.linalg.norm(np.median(views, axis=0))
+    oblique = views @ ahead < np.cos(np.radians(OBLIQUE_ANGLE_DEG))
+    is_level = _range(heights) <= MIN_HEIGHT_SPREAD * np.median(heights)
+    return int(oblique.sum()), bool(oblique.mean() < MIN_OBLIQUE_SHARE), bool(is_level)
 
 
 def is_contradicted(

@@ -202,7 +202,7 @@ def _placed_again(prepared: ReconstructionPlan, before: ReconstructionReport) ->
     """The model of a finished capture where it belongs now. Nothing is written; raises CaptureError for positions,
     distances and control points that are refused, and for a lens that these fit to none that there is."""
     model = pycolmap.Reconstruction(prepared.request.output / MAPPED)
-    found = georeference(model, prepared, (before.focal_fixed, before.focal_reason))
+    found = georeference(model, prepared, (before.focal_fixed, focal_reason(before.focal_reason)))
     _lenses(found.model)
     return found
 

@@ -40,6 +40,8 @@ APART_ACROSS, BAROMETER_M, BAROMETER_SHARE = 4.0, 1.0, 0.02
 #: Of two deviations the smaller is plainly better below this share of the larger, and counts alone: what is left of the
 #: other would make good positions disagree. What is that many deviations off agrees with nothing (choice).
 PLAINLY_BETTER, APART_SIGMAS = 0.5, 3.0
+#: Of positions that state what they are good for up this share is as good (choice).
+NEARLY_ALL = 0.9
 #: Views may be so far from straight down that recorded heights tell the factor (cosine; choice).
 DOWN_COSINE = 0.9
 #: Heights that leave more open (share) say nothing against a drift of altitudes (choice).
@@ -141,8 +143,8 @@ def stretched(model: pycolmap.Reconstruction, stretch: Stretch, threads: int) ->
 
 
 def with_stretch(placed: Georegistration, stretch: Stretch | None, model: pycolmap.Reconstruction) -> Georegistration:
-    """The same with the accuracy that heights have where the factor is open, and notes of it. `model`: as it was
-    placed, before it is moved."""
+    """The same with the accuracy that places have along the views where the factor is open, and notes of it. `model`:
+    as it was placed, before it is moved."""
     if stretch is None or placed.accuracy is None:
         return placed
     notes, accuracy = list(placed.notes), placed.accuracy
@@ -152,16 +154,18 @@ def with_stretch(placed: Georegistration, stretch: Stretch | None, model: pycolm
             f"{math.expm1(stretch.log):+.2%} from what it was, and so are heights."
         )
     away = 2 * stretch.deviation * placed.similarity.scale * viewing_distance(placed_images(model), model)
-    across, *up = accuracy.place_m or ()
-    looks_down = abs((placed.similarity.rotation @ stretch.axis)[2]) >= DOWN_COSINE
-    if looks_down and up and math.isfinite(away):
-        if away > up[0]:
+    place, view = accuracy.place_m, placed.similarity.rotation @ stretch.axis
+    along = float(np.linalg.norm(view[:2])) * away, abs(float(view[2])) * away
+    if place and math.isfinite(away):
+        looks_down = bool(abs(view[2]) >= DOWN_COSINE)
+        if along[looks_down] > (*place, math.inf)[looks_down]:
+            what, where = ("the ground", "higher or lower") if looks_down else ("what they show", "nearer or farther")
             notes.append(
                 "the views are too parallel, or all of one height, to tell the focal length, known to "
-                f"±{200 * stretch.deviation:.2g} % by {stretch.how}: the ground may lie "
-                f"{two_digits(away)} m higher or lower (95 %). Oblique views or control points tell it."
+                f"±{200 * stretch.deviation:.2g} % by {stretch.how}: {what} may lie "
+                f"{two_digits(away)} m {where} (95 %). Oblique views or control points tell it."
             )
-        accuracy = replace(accuracy, place_m=(across, math.hypot(up[0], away)))
+        accuracy = replace(accuracy, place_m=tuple(map(math.hypot, place, along)))
     return replace(placed, accuracy=accuracy, notes=tuple(notes))
 
 
@@ -210,6 +214,8 @@ class _Flown:
     taken: Sequence[ImageMetadata]
     up_std: np.ndarray
     """What altitudes are said to be good for [m], metres."""
+    lenses: np.ndarray
+    """Numbers of the lenses that they were taken through [m]."""
 
     @classmethod
     def of(
@@ -226,7 +232,8 @@ class _Flown:
         problem = problem_of(taken, rows, centers, up, positions, stated=stated)
         plane = fit_positions(replace(problem, has_altitudes=False))
         looks_down = up.sure and (plane.similarity.rotation @ axis)[2] <= -DOWN_COSINE
-        return cls(problem, plane, axis, taken, positions.gps_std[rows, 2]) if looks_down else None
+        lenses = np.array([images[photo.name].camera_id for photo in taken])
+        return cls(problem, plane, axis, taken, positions.gps_std[rows, 2], lenses) if looks_down else None
 
     def fit(self, log: float) -> PositionFit:
         """To positions, were the model stretched by that."""
@@ -236,13 +243,16 @@ class _Flown:
 
 def _by_heights(flown: _Flown) -> Known | None:
     """What recorded altitudes, and heights over the take-off, say of the factor: by how many times more they differ
-    than heights by the photographs, where positions in the plane tell the scale."""
+    than heights by the photographs, where positions in the plane tell the scale. Heights are compared through one lens:
+    those through another are as far off as the proportion of the two."""
     inside, heights = flown.plane.inliers, flown.plane.placed[:, 2]
     places, tilt = flown.plane.placed[inside], math.tan(math.radians(flown.problem.up.deviation_deg))
-    flights, found = flights_of(flown.taken), list[Known]()
+    flights, found = _parted(flights_of(flown.taken), flown.lenses), list[Known]()
     if flown.problem.has_altitudes:
-        of_flight = np.zeros(len(heights), int) if (flown.up_std <= FIXED_M).all() else flights
-        apart = min(DRIFT_M, APART_ACROSS * float(flown.plane.gps_std[:2].mean()))
+        of_flight = flown.lenses if (flown.up_std <= FIXED_M).all() else flights
+        stated = flown.problem.stated
+        said = 0.0 if stated is None else float(np.quantile(stated[:, 2], NEARLY_ALL))  # one height may be worse
+        apart = min(DRIFT_M, max(said, APART_ACROSS * float(flown.plane.gps_std[:2].mean())))
         off = flown.problem.targets[:, 2] - heights
         found.append(factor_of_heights(places, off[inside], of_flight[inside], tilt, apart))
     recorded = [math.nan if photo.relative_altitude is None else photo.relative_altitude for photo in flown.taken]
@@ -251,6 +261,11 @@ def _by_heights(flown: _Flown) -> Known | None:
         known = factor_of_heights(places, (relative - heights)[inside], flights[inside], tilt, BAROMETER_M)
         found.append(Known(known.log, math.hypot(known.deviation, BAROMETER_SHARE), BY_BAROMETER))
     return _joined(found)
+
+
+def _parted(flights: np.ndarray, lenses: np.ndarray) -> np.ndarray:
+    """Numbers [n] of flights that were also flown with one lens each."""
+    return np.unique(np.column_stack([flights, lenses]), axis=0, return_inverse=True)[1].ravel()
 
 
 def _likelier(found: Known, before: Known, heights: Known, flown: _Flown) -> Known:
