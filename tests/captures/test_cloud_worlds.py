@@ -45,4 +45,4 @@ def test_cameras_that_hardly_moved_see_what_is_far(step: float) -> None:
         assert placed(points, eyes(step), others, notes) is points
     assert notes == []
     with pytest.raises(CaptureError, match=r"where the cameras look .*Mend it"):
-        placed(points + [5e3, 0, 0], eyes(step), [], notes)
+        placed(points + np.array([5e3, 0, 0]), eyes(step), [], notes)
