@@ -40,7 +40,6 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.system.stop_signals import STOP_SIGNALS
 from vdgs.viewer import navigation, server
 from vdgs.viewer.client_session import ClientSession
-from vdgs.viewer.client_session import ClientSession
 from vdgs.viewer.layers import Painter
 from vdgs.viewer.live_run import open_run_or_checkpoint, run_file_times, run_status_markdown
 from vdgs.viewer.measurement import MeasuredPoint
