@@ -74,6 +74,18 @@ def test_names_without_extension_may_hold_a_dot(tmp_path, both):
     assert_sees_the_scene(load_capture(tmp_path), both, lambda view: view.replace("v1.2_", ""))
 
 
+@pytest.mark.parametrize("path", ["%2e%2e/outside/{}", "%2e%2e%2Foutside/{}", "%2e%2e", "%2F"])
+def test_paths_as_in_a_uri_lead_out_of_no_set(tmp_path, scene, path):
+    """What climbs is left out of them too."""
+    write_blender(tmp_path / "set", *halves(scene))
+    change_files(tmp_path / "set", write_names(lambda name: path.format(name)))
+    (tmp_path / "outside").mkdir()
+    for side in ("train", "test"):
+        (tmp_path / "set" / side).rename(tmp_path / "outside" / side)
+    with pytest.raises(CaptureError, match=r"12 of 12 images .* are missing"):
+        load_capture(tmp_path / "set")
+
+
 @pytest.mark.parametrize("inside", [True, False])
 def test_photographs_may_lie_in_another_folder(tmp_path, both, inside):
     """The remedy that the error names works, and the error speaks of no archives, which such sets do not have."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -219,6 +220,17 @@ def test_pictures_that_only_lie_there_keep_no_file_away(tmp_path: Path) -> None:
             assert not is_refused(folder / name), name
         assert is_refused(folder)  # many files would be mixed with them
     frames = photographs(tmp_path / "frames", 5)  # of a film, without what a camera says
+    (frames / "notes.txt").touch()
+    assert is_refused(frames / "film.mp4")
+
+
+@pytest.mark.parametrize("beside", [(".txt", ".json"), (".JPG.xmp", ".MP4", ".SRT"), ("_mask.png", ".xmp")])
+def test_what_belongs_to_pictures_makes_their_folder_none_of_other_work(tmp_path: Path, beside: Sequence[str]) -> None:
+    """Labels and records of each picture, and the films of the same card."""
+    frames = photographs(tmp_path / "frames", 5)
+    for picture in list(frames.iterdir()):
+        for ending in beside:
+            picture.with_name(picture.stem + ending).touch()
     (frames / "notes.txt").touch()
     assert is_refused(frames / "film.mp4")
 

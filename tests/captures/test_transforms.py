@@ -254,6 +254,40 @@ def test_photographs_in_a_folder_of_another_name_are_found_and_told(tmp_path, sc
         load_capture(tmp_path)
 
 
+@pytest.mark.parametrize(("meant", "there"), [("test", "train"), ("flight1", "flight2"), ("val/rgb", "Train/rgb")])
+def test_photographs_of_another_folder_of_the_kind_are_not_taken(tmp_path, scene, meant, there):
+    """Train and test photographs, and those of two flights, have the same names."""
+    content = write_transforms(tmp_path, scene)
+    (tmp_path / there).parent.mkdir(exist_ok=True)
+    (tmp_path / "images").rename(tmp_path / there)
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].replace("images", meant)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="are missing"):
+        load_capture(tmp_path)
+    (tmp_path / there).rename(tmp_path / "photographs")
+    assert len(load_capture(tmp_path).views) == len(scene.cameras)
+
+
+def test_names_that_are_partly_there_twice_say_nothing_of_the_others(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    (tmp_path / "images").rename(tmp_path / "train")
+    (tmp_path / "test").mkdir()
+    for name in list(scene.cameras)[:3]:
+        shutil.copy(tmp_path / "train" / name, tmp_path / "test")
+    with pytest.raises(CaptureError, match=r"may be test/frame_000\.png or train/.*--images"):
+        load_capture(tmp_path)
+
+
+def test_masks_outside_of_the_capture_are_refused_as_in_a_uri_too(tmp_path, scene):
+    content = write_transforms(tmp_path / "place", scene)
+    content["frames"][0]["mask_path"] = "%2e%2e/mask.png"
+    Image.new("L", (64, 48), 255).save(tmp_path / "mask.png")
+    (tmp_path / "place" / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="not a path inside the capture"):
+        load_capture(tmp_path / "place")
+
+
 def test_paths_as_in_a_uri_are_those_of_files_with_blanks(tmp_path, scene):
     """Where the file is not there as it is written; names with a percent sign stay."""
     named = {f"a%20{k}.png" if k == 5 else f"a {k}.png": camera for k, camera in enumerate(scene.cameras.values())}

@@ -7,6 +7,7 @@ import io
 import json
 import re
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,10 @@ from support.hand_made_models import capture_at, ground, model_at
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
+from vdgs.export import export_run as export_module
 from vdgs.export import local_bake
 from vdgs.export.bake import collect_contributions
+from vdgs.export.export_loss import ExportLoss
 from vdgs.export.export_run import RECORD_FILE, export_run, resolve_request
 from vdgs.export.formats import html, registry
 from vdgs.export.formats.export_scene import ExportMetadata, InitialView
@@ -62,7 +65,7 @@ def export(tmp_path: Path):
 
     def run(
         *names: str, model: AnchorModel | None = None, origin: tuple[float, float, float] | None = None,
-        color_iterations: int | None = 1, **asked: Any,
+        color_iterations: int | None = 1, evaluate: bool = False, console: Console | None = None, **asked: Any,
     ) -> dict[str, Any]:  # fmt: skip
         file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
         shown.save(file)
@@ -78,10 +81,10 @@ def export(tmp_path: Path):
         )
         paths = {name: tmp_path / name for name in names}
         request = ExportRequest(
-            run=tmp_path / "run", output=tuple(paths[name] for name in names), evaluate=False, device="cpu",
+            run=tmp_path / "run", output=tuple(paths[name] for name in names), evaluate=evaluate, device="cpu",
             color_iterations=color_iterations, **asked,
         )  # fmt: skip
-        return export_run(opened, resolve_request(request), QUIET)
+        return export_run(opened, resolve_request(request), console or QUIET)
 
     return run
 
@@ -100,6 +103,38 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     assert read_json(tmp_path / "run" / RECORD_FILE) == record
     assert [Path(file["file"]).name for file in record["files"]] == ["a.ply", "b.splat", "c.ply", "d.points.ply"]
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("names", "degrees", "said"),
+    [
+        (("a.ply", "b.sog", "c.glb"), [3], ["a.ply, read back, on", "b.sog, c.glb: not read back, so not compared"]),
+        (("b.sog", "c.glb"), [0, 3], ["b.sog: not read back; the Gaussians before", "c.glb: not read back; the"]),
+        (("c.glb", "d.glb"), [3], ["c.glb, d.glb: not read back; the Gaussians before they were written to it, on"]),
+    ],
+)  # fmt: skip
+def test_a_loss_is_that_of_the_file_or_said_to_be_of_its_gaussians(
+    export, names: tuple[str, ...], degrees: list[int], said: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Where colors are fixed for one of the files, its figure is not that of the scene as it was baked."""
+    measured = list[int]()
+
+    def measure(run: OpenedRun, pieces: Iterable[Gaussians], after_view: object) -> ExportLoss:
+        measured.append(max(piece.sh_degree for piece in pieces))
+        return ExportLoss(
+            views=1, views_available=1, of="test", psnr=30.0, psnr_baked=29.0, psnr_cc=30.0, psnr_cc_baked=29.0,
+            ssim=0.9, ssim_baked=0.8, by_visibility=[],
+        )  # fmt: skip
+
+    monkeypatch.setattr(export_module, "measure_loss", measure)
+    monkeypatch.setattr(export_module, "views_to_measure", lambda run: [])
+    monkeypatch.setattr(export_module, "choose_fixed_colors", lambda *asked: (True, "fixed"))
+    console = Console(file=io.StringIO(), width=500)
+    record = export(*names, evaluate=True, console=console)
+    assert measured == degrees
+    printed = console.file.getvalue()
+    assert all(line in printed for line in said)
+    assert [each["file"] is None for each in record["losses"]] == [names[0] != "a.ply"] * len(degrees)
 
 
 def test_the_run_notes_files_within_it_as_they_lie_in_it(export, tmp_path: Path):

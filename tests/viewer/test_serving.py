@@ -13,6 +13,7 @@ import sys
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -280,6 +281,24 @@ def test_the_first_view_lies_beside_the_panel(viewer, width: int, height: int, f
     if not is_phone:
         assert middle + half <= width - panel + 2
         assert middle - half >= -2
+
+
+def test_a_canvas_without_pixels_is_no_other_canvas(viewer):
+    """Of a window that is hidden or laid out: the first view stays, and is fitted once there is a canvas."""
+    session = ClientSession.__new__(ClientSession)
+    stands = navigation.fitted_pose(viewer.scene.first_view, (1920, 1000))
+    camera = SimpleNamespace(image_width=0, image_height=0, position=stands.position, look_at=stands.look_at)
+    session.scene, session.client = viewer.scene, SimpleNamespace(camera=camera)
+    session._is_at_first_view, session._fitted, session._camera = True, (1920, 1000), object()
+    session._on_camera_moved = lambda: None
+    moves = list[navigation.CameraPose]()
+    session.move_to = moves.append
+    session._on_browser_moved()
+    assert moves == []
+    camera.image_width, camera.image_height = 400, 800
+    session._on_browser_moved()
+    (moved,) = moves
+    assert moved.distance == pytest.approx(2 * stands.distance, rel=0.01)
 
 
 @quiet

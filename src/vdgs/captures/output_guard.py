@@ -150,15 +150,20 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
     if output == folder:
         return len(pictures) >= _MANY_PICTURES or any(map(has_camera, pictures))
     if _is_written_into(folder, output):
-        return _series_length(pictures) >= max(_MANY_PICTURES, len(names) / 2) or any(map(has_camera, pictures))
+        return _series_length(pictures, names) >= max(_MANY_PICTURES, len(names) / 2) or any(map(has_camera, pictures))
     return len(pictures) >= max(_MANY_PICTURES, len(names) / 2)
 
 
-def _series_length(pictures: Sequence[Path]) -> int:
-    """How many pictures belong to a series, as a camera or a film leaves it: three or more of one ending whose names
-    differ by their numbers."""
-    series = Counter((re.sub(r"\d+", "0", picture.stem), picture.suffix.lower()) for picture in pictures)
-    return sum(count for count in series.values() if count >= _MANY_PICTURES)
+def _series_length(pictures: Sequence[Path], names: Collection[str]) -> int:
+    """How many files belong to a series, as a camera or a film leaves it: three pictures or more of one ending whose
+    names differ by their numbers, and what is called like these (films, and what says something of each picture)."""
+    counts = Counter((_without_numbers(picture.name), picture.suffix.lower()) for picture in pictures)
+    series = {name for (name, _), count in counts.items() if count >= _MANY_PICTURES}
+    return sum(_without_numbers(name) in series for name in names)
+
+
+def _without_numbers(name: str) -> str:
+    return re.sub(r"\d+", "0", Path(name).stem)
 
 
 def _without_undistorted(pictures: list[Path], names: Collection[str]) -> list[Path]:

@@ -240,7 +240,8 @@ class ExportRequest(ModelRequest):
     """Also write sky and what is far away: an equirectangular PNG. Its middle looks east (+x), columns go clockwise.
     Files of Gaussians leave them out."""
     evaluate: bool = True
-    """Report what was lost. A file is read back and its test views are compared with those of the model itself."""
+    """Report what was lost. Test views of a file that is read back are compared with those of the model. .sog, .rad,
+    .glb, 3D Tiles, lod-meta.json and points are not: of these alone, the Gaussians are, before they are written."""
     threads: Annotated[int, WORKER_COUNT] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --optimize-seconds."""
 

@@ -28,7 +28,7 @@ from vdgs.export.bake import gaussian_count
 from vdgs.export.bake_plan import drop_unused_sh_degrees
 from vdgs.export.color_refinement import BakedGaussians
 from vdgs.export.distributed_bake import DistributedBake, distributed_bake, forget_shards
-from vdgs.export.export_loss import measure_loss, views_to_measure
+from vdgs.export.export_loss import ExportLoss, measure_loss, views_to_measure
 from vdgs.export.file_coordinates import FileCoordinates, axes_of_file, coordinates_of_file
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialView
@@ -98,6 +98,15 @@ class _BakedScene:
             check_stop_requested()
             yield self.spool.rows(rows[first : first + CHUNK_SIZE])
             self.spool.release_pages()
+
+
+@dataclass(frozen=True, eq=False)
+class _WrittenFile:
+    """What is to be said of a file, and the Gaussians that its writer was given: rows of a scene."""
+
+    facts: ExportedFile
+    scene: _BakedScene
+    rows: Int[np.ndarray, " r"]
 
 
 def make_initial_view(run: OpenedRun, most_bytes: int) -> InitialView:
@@ -226,16 +235,17 @@ def write_files(
         seconds = time.monotonic() - began
         scene = _BakedScene(shown.spool, request.baked_sh_degree, page, request)
         fixed = FixedColors(baker.training, request.output[0].parent / BAKING, stack)
-        files = [
-            _write_fitting(path, frames[path], scene, rows[path], merging, fixed, whole) for path in request.output
-        ]
-        losses = _measure_losses(whole, frames, scene, request, console)
+        written = {
+            path: _write_fitting(path, frames[path], scene, rows[path], merging, fixed, whole)
+            for path in request.output
+        }
+        losses = _measure_losses(whole, frames, written, console) if request.evaluate else []
     if request.background is not None:
         write_background(run, request.background)
     record: ExportDocument = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.baked_sh_degree,
-        "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds, "files": files,
-        "losses": losses,
+        "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds,
+        "files": [each.facts for each in written.values()], "losses": losses,
     })  # fmt: skip
     return record
 
@@ -255,7 +265,7 @@ def _print_systems(systems: Mapping[Path, FileCoordinates], console: Console) ->
 def _write_fitting(
     path: Path, frame: LocalFrame, scene: _BakedScene, rows: Int[np.ndarray, " r"], merging: SceneMerging,
     fixed: FixedColors, run: OpenedRun,
-) -> ExportedFile:  # fmt: skip
+) -> _WrittenFile:  # fmt: skip
     """Write a file, of as many Gaussians as it has room for, in colors that it holds well."""
     notes, count = list[str](), _capacity(path, scene)
     if count < len(rows):
@@ -266,7 +276,7 @@ def _write_fitting(
     scene, note = _with_fitting_colors(path, frame, scene, rows, fixed, run)
     notes += [note] if note else []
     system = coordinates_of_file(path, frame, scene.request)
-    return _write(path, system, scene.scene(frame, rows, path), merging.console, notes)
+    return _WrittenFile(_write(path, system, scene.scene(frame, rows, path), merging.console, notes), scene, rows)
 
 
 def _with_fitting_colors(
@@ -386,31 +396,61 @@ def _size(path: Path) -> int:
 
 
 def _measure_losses(
-    run: OpenedRun, frames: dict[Path, LocalFrame], baked: _BakedScene, request: ExportRequest, console: Console
+    run: OpenedRun, frames: Mapping[Path, LocalFrame], written: Mapping[Path, _WrittenFile], console: Console
 ) -> list[JsonObject]:
-    """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
-    if not request.evaluate:
-        return []
-    readable: list[Path | None] = [path for path in request.output if registry.format_from_path(path).read]
+    """What each file that can be read back loses, or, where none can, the Gaussians that writers were given; which
+    files are not read back is said."""
+    readable = [path for path in written if registry.format_from_path(path).read]
+    others = [path for path in written if path not in readable]
+    alike = [] if readable else _of_same_gaussians(written)
     losses = []
     with make_progress_bar(console) as bar:
-        task = bar.add_task("comparing with the model", total=len(readable or [None]) * len(views_to_measure(run)))
+        count = (len(readable) + len(alike)) * len(views_to_measure(run))
+        task = bar.add_task("comparing with the model", total=count)
 
         def after_view() -> None:
             check_stop_requested()
             bar.advance(task)
 
-        for path in readable or [None]:
-            every = np.arange(len(baked.spool.means))
-            pieces = baked.pieces(every) if path is None else map(frames[path].to_ground, registry.read_chunks(path))
-            loss = measure_loss(run, pieces, after_view)
-            what = "as baked" if path is None else f"{path.name}, read back"
-            console.print(
-                f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "
-                f"({loss.psnr_baked - loss.psnr:+.2f}; with the exposure of each photograph corrected "
-                f"{loss.psnr_cc:.2f} → {loss.psnr_cc_baked:.2f}, {loss.psnr_cc_baked - loss.psnr_cc:+.2f}), "
-                f"SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
-                highlight=False,
-            )
-            losses.append({"file": None if path is None else str(path.resolve()), **asdict(loss)})
+        for path in readable:
+            pieces = map(frames[path].to_ground, registry.read_chunks(path))
+            losses.append(_measured(f"{path.name}, read back", path, measure_loss(run, pieces, after_view), console))
+        for paths in alike:
+            first = written[paths[0]]
+            what = f"{_names(paths)}: not read back; the Gaussians before they were written to it"
+            loss = measure_loss(run, first.scene.pieces(first.rows), after_view)
+            losses.append(_measured(what, None, loss, console))
+    if readable and others:
+        console.print(f"{_names(others)}: not read back, so not compared", markup=False, highlight=False)
     return losses
+
+
+def _of_same_gaussians(written: Mapping[Path, _WrittenFile]) -> list[list[Path]]:
+    """The files by the Gaussians that their writers were given."""
+    groups = list[list[Path]]()
+    for path, file in written.items():
+        for group in groups:
+            first = written[group[0]]
+            if first.scene.spool is file.scene.spool and np.array_equal(first.rows, file.rows):
+                group.append(path)
+                break
+        else:
+            groups.append([path])
+    return groups
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ", ".join(path.name for path in paths)
+
+
+def _measured(what: str, path: Path | None, loss: ExportLoss, console: Console) -> JsonObject:
+    """Print a loss; returns it for the record."""
+    console.print(
+        f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "
+        f"({loss.psnr_baked - loss.psnr:+.2f}; with the exposure of each photograph corrected "
+        f"{loss.psnr_cc:.2f} → {loss.psnr_cc_baked:.2f}, {loss.psnr_cc_baked - loss.psnr_cc:+.2f}), "
+        f"SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
+        markup=False,
+        highlight=False,
+    )
+    return {"file": None if path is None else str(path.resolve()), **asdict(loss)}

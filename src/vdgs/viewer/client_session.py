@@ -153,7 +153,8 @@ class ClientSession:
 
     def _on_browser_moved(self) -> None:
         self._on_camera_moved()
-        if self._is_at_first_view and self._camera is not None and self._canvas != self._fitted:
+        # A canvas without pixels is one that is just being laid out, or hidden.
+        if self._is_at_first_view and self._camera is not None and self._canvas != self._fitted and all(self._canvas):
             self._fit_first_view()
 
     def _fit_first_view(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +23,8 @@ PARTS, VIEWS_LOOKED_AT, POINTS_IN_PARTS = 4, 40, 50_000
 #: A cloud is in other coordinates than it should be where it covers so many times more of the photographs there
 #: (choice), and of another place where it covers less of them than this, and `LEAST_SEEN` is not met.
 BETTER, LEAST_COVERED = 2.0, 0.1
+#: Fewer points cover too little to tell by that alone: they stay where photographs see them (choice).
+ENOUGH_POINTS = 50
 
 #: The name of some coordinates, and what brings points [n, 3] from there.
 CloudFrame = tuple[str, Callable[[np.ndarray], np.ndarray]]
@@ -34,20 +37,21 @@ class Eye(NamedTuple):
     lens: Intrinsics
 
 
-def share_seen(points: np.ndarray, eyes: Sequence[Eye]) -> float:
-    """The share of points [n, 3] that lie before some camera, where its photograph is."""
+def share_seen(points: np.ndarray, eyes: Sequence[Eye], farthest: float | None = None) -> float:
+    """The share of points [n, 3] that lie before some camera, where its photograph is, and no farther away than
+    `farthest` (by default by `MAX_DISTANCE_RATIO`)."""
     points = points[np.isfinite(points).all(axis=1)]
-    farthest = _farthest(eyes)
+    farthest = _farthest(eyes) if farthest is None else farthest
     seen = np.zeros(len(points), bool)
     for eye in eyes:
         seen |= _shares_of_sides(points, eye, farthest)[0]
     return float(seen.mean()) if len(seen) else 0.0
 
 
-def share_covered(points: np.ndarray, eyes: Sequence[Eye]) -> float:
-    """The share of the parts of some photographs that show a point."""
+def share_covered(points: np.ndarray, eyes: Sequence[Eye], farthest: float | None = None) -> float:
+    """The share of the parts of some photographs that show a point, as `share_seen` has it."""
     points = points[np.isfinite(points).all(axis=1)]
-    farthest, covered = _farthest(eyes), list[float]()
+    farthest, covered = _farthest(eyes) if farthest is None else farthest, list[float]()
     for eye in eyes[:: max(1, len(eyes) // VIEWS_LOOKED_AT)]:
         seen, across, down = _shares_of_sides(points, eye, farthest)
         parts = np.floor(PARTS * np.column_stack([across[seen], down[seen]])).clip(0, PARTS - 1)
@@ -61,24 +65,25 @@ def in_world_of(
     """Points [n, 3] of a cloud in the world of cameras: as they are, unless they cover far more of the photographs once
     brought there from one of `others`, which a note says.
 
+    As they are, they may be at any distance: cameras that hardly moved look at what is far for their spread.
+
     Raises `CaptureError`, with the `remedy`, for a cloud that hardly any photograph shows.
     """
     if not len(points) or not eyes:
         return points
     looked_at = sample_points(points, POINTS_IN_PARTS)
     with np.errstate(all="ignore"):
-        usual = share_covered(looked_at, eyes)
+        usual = share_covered(looked_at, eyes, math.inf)
+        seen = share_seen(sample_points(points, POINTS_LOOKED_AT), eyes, math.inf)
         found = [(share_covered(change(looked_at), eyes), name, change) for name, change in others]
         best, name, change = max(found, key=lambda each: each[0], default=(0.0, "", lambda points: points))
-        if best > BETTER * usual and best >= LEAST_COVERED:
+        can_tell = len(looked_at) >= ENOUGH_POINTS or seen < LEAST_SEEN
+        if can_tell and best > BETTER * usual and best >= LEAST_COVERED:
             notes.append(
                 f"{cloud.name}: its points are {name}, where the photographs show them; they are brought over."
             )
             return change(points)
-        if usual >= LEAST_COVERED:
-            return points
-        seen = share_seen(sample_points(points, POINTS_LOOKED_AT), eyes)
-    if seen < LEAST_SEEN:
+    if usual < LEAST_COVERED and seen < LEAST_SEEN:
         raise CaptureError(
             f"{cloud}: its points are not where the cameras look ({seen:.0%} fall into photographs): it is in other "
             "coordinates, or of another place, or the poses are of another convention (OpenCV's axes in place of "

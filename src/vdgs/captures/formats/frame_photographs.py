@@ -38,8 +38,9 @@ class FramePhotographs:
         pose of one of them would be of another photograph.
         """
         parts = _parts(frame, file)
-        decoded = tuple(map(unquote, parts))  # as in a URI: a%20b.png
-        return self._find(parts, file, split) or self._find(decoded, file, split) or "/".join(parts)
+        decoded = _inside(PureWindowsPath(*map(unquote, parts)).parts)  # as in a URI: a%20b.png
+        found = self._find(parts, file, split) or (self._find(decoded, file, split) if decoded else None)
+        return found or "/".join(parts)
 
     def _find(self, parts: tuple[str, ...], file: Path, split: Split) -> tuple[str, Path] | None:
         tails = [parts, (split, *parts[-2:]), *(parts[k:] for k in range(1, len(parts)))]

@@ -53,8 +53,11 @@ def mask_of_frame(frame: JsonObject, file: Path, root: Path) -> Path | None:
     """The mask that a frame names, also as in a URI (`%20`). Raises `CaptureError` for a path that leaves the
     capture."""
     mask = frame.get("mask_path")
-    name = safe_name(str(mask), file, "mask_path", root) if mask else None
-    return (find_file(root, name) or find_file(root, unquote(name)) or root / name) if name else None
+    if not mask:
+        return None
+    name = safe_name(str(mask), file, "mask_path", root)
+    decoded = safe_name(unquote(name), file, "mask_path", root)
+    return find_file(root, name) or find_file(root, decoded) or root / name
 
 
 def read_capture_json(file: Path) -> JsonObject:
