@@ -421,8 +421,8 @@ def test_a_run_of_photographs_is_known_by_these_whatever_else_the_command_says(m
     same = "vdgs run /photos/a --gps /photos/g.csv --sfm.matching exhaustive --output /now/run --iterations 40"
     others = (
         same.replace("/photos/a", "/photos/b"), same.replace("exhaustive", "sequential"),
-        same.replace("--gps /photos/g.csv ", ""), f"{same} --extra-image-folders /photos/b",
-        same.replace("/photos/a", "/photos/a /photos/b"), f"{same} --config /other/positions.yaml",
+        same.replace("--gps /photos/g.csv ", ""), same.replace("/photos/a", "/photos/a /photos/b"),
+        f"{same} --config /other/positions.yaml",
     )  # fmt: skip
     assert same_photographs(moved_run, same)
     assert [same_photographs(moved_run, other) for other in others] == [False] * len(others)

@@ -26,9 +26,9 @@ from vdgs.system.atomic_files import read_json_or_empty
 #: What photographs and masks are called.
 PICTURE_SUFFIXES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
 
-#: Options of `vdgs run`, beside `--sfm.*` and the folders, that a capture of photographs depends on; a file of settings
-#: may name a table of positions or a scale bar.
-_PHOTOGRAPH_FLAGS = ("", "--capture", "--extra-image-folders", "--gps", "--scale-bar", "--config")
+#: Options of `vdgs run`, beside `--sfm.*` and the folders (words without an option), that a capture of photographs
+#: depends on; a file of settings may name a table of positions or a scale bar.
+_PHOTOGRAPH_FLAGS = ("", "--gps", "--scale-bar", "--config")
 
 
 def nothing_to_do(request: RunRequest, command: str, files: Sequence[Path] = ()) -> str:
