@@ -221,7 +221,7 @@ class ExportRequest(ModelRequest):
     then moved towards the model's images."""
     sh_degree: Literal[0, 1, 2, 3] | None = None
     """Degree of the spherical harmonics of colors. 0: the same from everywhere, and a quarter of the size. By default
-    3, or 0 in formats that round them (.compressed.ply, .spz, .sog, .rad, 3D Tiles) where views show no gain of 0.05 dB.
+    3, or 0 in formats that round them (.compressed.ply, .spz, .sog, .rad, 3D Tiles) if views show no gain of 0.05 dB.
     """
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
     """Largest size of a .html file in MB. The scene is merged until it fits."""
