@@ -66,6 +66,27 @@ def drawn(gaussians: Gaussians, model: AnchorModel, camera) -> np.ndarray:
     return picture.image.numpy()
 
 
+def flat(decoder: Decoder) -> Decoder:
+    """The decoder of which every second Gaussian has a scale so small that it is 0 in float32."""
+    weights = decoder.weights
+    b2 = weights.covariance.b2.clone()
+    b2.view(-1, 7)[::2, 0] = -200.0
+    return replace(decoder, weights=replace(weights, covariance=replace(weights.covariance, b2=b2)))
+
+
+def test_gaussians_of_no_thickness_are_baked_very_thin():
+    model = model_at(scattered())
+    model = replace(model, decoder=flat(model.decoder))
+    rows, _ = decode_view(model, VIEWS[0])
+    assert (decode_world(model.anchors, rows, model.decoder.weights, VIEWS[0]).scales == 0).any()
+    gaussians = baked(collect_contributions(model, VIEWS))
+    assert all(bool(tensor.isfinite().all()) for tensor in gaussians.tensors().values())
+    assert gaussians.log_scales.min().exp() < 1e-6
+    with torch.no_grad():
+        own = render(model, VIEWS[0]).image.numpy()
+    assert np.abs(drawn(gaussians, model, VIEWS[0]) - own).mean() < 0.01
+
+
 def test_what_is_spawned_is_what_the_kernels_decode():
     model = model_at(scattered())
     k = model.anchors.offsets.shape[1]

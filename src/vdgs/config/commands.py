@@ -220,8 +220,8 @@ class ExportRequest(ModelRequest):
     """Largest number of Gaussians; 0: all. Neighbors are merged, those first by which the pictures change least, and
     then moved towards the model's images."""
     sh_degree: Literal[0, 1, 2, 3] | None = None
-    """Degree of the spherical harmonics of colors. 0: the same from everywhere, and a fifth of the size. By default 3,
-    or 0 in formats that round them (.compressed.ply, .spz, .sog, .rad, 3D Tiles) where views show no gain of 0.05 dB.
+    """Degree of the spherical harmonics of colors. 0: the same from everywhere, and a quarter of the size. By default
+    3, or 0 in formats that round them (.compressed.ply, .spz, .sog, .rad, 3D Tiles) if views show no gain of 0.05 dB.
     """
     html_max_mb: Annotated[float, Range(1, 2000)] = 30.0
     """Largest size of a .html file in MB. The scene is merged until it fits."""

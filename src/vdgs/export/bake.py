@@ -38,6 +38,9 @@ ANCHORS_PER_PART = 4096
 RIDGE_WEIGHT = 1e-3
 #: Opacities are kept away from 0 and 1, where their logits have no end.
 OPACITY_MARGIN = 1e-4
+#: A decoder may flatten a Gaussian so much that its scale is 0 in float32, which has no logarithm. No picture shows how
+#: thin it is below this, in units of the scene.
+LEAST_SCALE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +205,8 @@ def _decode_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple
     )
     means = gaussian_means(anchors.select(rows)).flatten(0, 1).cpu().index_select(0, spread)
     rays = means - torch.from_numpy(camera.position.astype(np.float32))
-    return torch.nn.functional.normalize(rays, dim=1), colors, opacities, scales.log(), quaternions
+    log_scales = scales.clamp_min(LEAST_SCALE).log()
+    return torch.nn.functional.normalize(rays, dim=1), colors, opacities, log_scales, quaternions
 
 
 def fit_gaussians(views: BakeViews, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
