@@ -102,6 +102,7 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
         assert (drawn - render(model, view.camera).image).abs().mean() < 0.01
     assert read_json(tmp_path / "run" / RECORD_FILE) == record
     assert [Path(file["file"]).name for file in record["files"]] == ["a.ply", "b.splat", "c.ply", "d.points.ply"]
+    assert [file["sh_degree"] for file in record["files"]] == [2, 0, 2, 0]
     assert not list(tmp_path.glob(".*"))
 
 

@@ -245,7 +245,7 @@ def write_files(
     record: ExportDocument = to_jsonable({
         "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.baked_sh_degree,
         "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds,
-        "files": [each.facts for each in written.values()], "losses": losses,
+        "files": [{**each.facts, "sh_degree": each.scene.degree} for each in written.values()], "losses": losses,
     })  # fmt: skip
     return record
 
