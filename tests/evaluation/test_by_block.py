@@ -17,6 +17,7 @@ from rich.console import Console
 from support.captures import render_plane
 from support.hand_made_models import camera_above, opaque_plane, quadrant_of, quadrants
 from vdgs.captures.capture import View
+from vdgs.config.method import MergeConfig
 from vdgs.errors import RunError
 from vdgs.evaluation.block_seams import MAX_SEAM_VIEWS, BlockInputs, evaluate_blocks, make_block_table
 from vdgs.evaluation.by_block import (
@@ -32,6 +33,8 @@ from vdgs.evaluation.renderable_model import ReferenceViews
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.renderer import render
+from vdgs.partition.blocks import xy_positions
+from vdgs.partition.merging import block_of_points
 
 CAMERAS = [
     camera_above(0.3, -0.2),
@@ -48,6 +51,11 @@ CAMERAS = [
         model="orthographic",
     ),
 ]
+
+
+def quadrant_at(positions: torch.Tensor) -> np.ndarray:
+    """The owner of each place, as merge rule `owner` has it."""
+    return quadrants().owner(xy_positions(positions))
 
 
 def plane_depth(camera: Camera, alpha: float = 1.0) -> Raster:
@@ -70,7 +78,7 @@ def plane_depth(camera: Camera, alpha: float = 1.0) -> Raster:
 @pytest.mark.parametrize("alpha", [1.0, 0.6])
 def test_labels_are_those_of_the_places_seen(camera: Camera, alpha: float):
     """Places projected by the camera fall on pixels with the label of their own block."""
-    labels = block_label_map(plane_depth(camera, alpha), camera, quadrants())
+    labels = block_label_map(plane_depth(camera, alpha), camera, quadrant_at)
     places = np.random.default_rng(0).uniform(-4, 4, (4000, 2))
     pixels, depth = camera.project(np.column_stack([places, np.zeros(len(places))]))
     inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
@@ -85,7 +93,7 @@ def test_labels_are_those_of_the_places_seen(camera: Camera, alpha: float):
 def test_a_pixel_shows_what_lies_at_its_center():
     quarter = 0.25 * 4.0 / 60.0  # of a pixel, on the ground
     camera = camera_above(-quarter, quarter)
-    labels = block_label_map(plane_depth(camera), camera, quadrants())
+    labels = block_label_map(plane_depth(camera), camera, quadrant_at)
     right, top = np.arange(64) >= 32, np.arange(48) < 24
     assert (labels == 2 * right[None, :] + top[:, None]).all()
 
@@ -93,25 +101,39 @@ def test_a_pixel_shows_what_lies_at_its_center():
 def test_the_sky_has_no_label():
     camera = CAMERAS[2]
     drawn = plane_depth(camera)
-    labels = block_label_map(drawn, camera, quadrants())
+    labels = block_label_map(drawn, camera, quadrant_at)
     assert ((labels == NO_BLOCK) == (drawn.alpha.numpy() == 0)).all()
     assert (labels == NO_BLOCK).any()
-    assert (block_label_map(plane_depth(camera, 0.4), camera, quadrants()) == NO_BLOCK).all()
+    assert (block_label_map(plane_depth(camera, 0.4), camera, quadrant_at) == NO_BLOCK).all()
 
 
 def test_labels_of_a_render():
     camera, model = camera_above(0.3, -0.2, tilt_deg=8, yaw_deg=30), opaque_plane()
-    drawn = block_label_map(render(model, camera, depth=True), camera, quadrants())
-    exact = block_label_map(plane_depth(camera), camera, quadrants())
+    drawn = block_label_map(render(model, camera, depth=True), camera, quadrant_at)
+    exact = block_label_map(plane_depth(camera), camera, quadrant_at)
     seen = drawn >= 0
     assert seen.mean() > 0.9
     assert (drawn == exact)[seen].mean() > 0.98
     assert set(np.unique(drawn[seen])) == {0, 1, 2, 3}
 
 
+def test_labels_follow_the_rule_of_the_merge():
+    """Where the cameras of a neighbor see more, the neighbor's ring is drawn, and the border is the ring's edge."""
+    camera = camera_above(0.0, 1.0)
+    cameras: list[list[Camera]] = [[], [camera_above(0, 0, 20.0)], [], []]
+    best_seen = MergeConfig("max-visibility")
+    at = lambda places: block_of_points(places, quadrants(ring=0.5), cameras, best_seen)  # noqa: E731
+    labels = block_label_map(plane_depth(camera), camera, at)
+    column, row = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+    x, y = (column - 32) / 15, 1.0 - (row - 24) / 15
+    expected = np.where((x < 0.5) & (y > -0.5), 1, 2 * (x > 0) + (y > 0))
+    assert (labels == expected).mean() > 0.99
+    assert (block_label_map(plane_depth(camera), camera, quadrant_at) != expected).mean() > 0.1
+
+
 def test_labels_need_depth():
     with pytest.raises(ValueError, match="depth"):
-        block_label_map(render(opaque_plane(), CAMERAS[0]), CAMERAS[0], quadrants())
+        block_label_map(render(opaque_plane(), CAMERAS[0]), CAMERAS[0], quadrant_at)
 
 
 label_maps = arrays(np.int16, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(-1, 2))
@@ -258,7 +280,7 @@ class Plane:
 
     def merged(self, camera: Camera) -> Raster:
         drawn = self._off(plane_depth(camera), 0.04)
-        border = torch.from_numpy(border_pixels(block_label_map(drawn, camera, quadrants())))
+        border = torch.from_numpy(border_pixels(block_label_map(drawn, camera, quadrant_at)))
         return drawn._replace(image=torch.where(border[..., None], 0.5 * drawn.image + 0.2, drawn.image))
 
     def block(self, index: int, camera: Camera) -> Raster | None:
@@ -273,7 +295,7 @@ class Plane:
         photographs = ReferenceViews(self.views, self.load_image, lambda _: mask)
         inputs = BlockInputs(
             reference_views=photographs, render_coarse=self.coarse, render_merged=self.merged, render_block=self.block,
-            blocks=quadrants(), **more,
+            num_blocks=4, block_at=quadrant_at, **more,
         )  # fmt: skip
         return evaluate_blocks(inputs, output)
 
@@ -326,7 +348,7 @@ def test_masked_pixels_change_nothing(tmp_path: Path):
     mask[:, :32] = True
     plane = Plane(CAMERAS[:1])
     result = plane.evaluate(tmp_path, mask)
-    labels = block_label_map(plane_depth(CAMERAS[0]), CAMERAS[0], quadrants())
+    labels = block_label_map(plane_depth(CAMERAS[0]), CAMERAS[0], quadrant_at)
     assert result["all"]["pixels"] == 48 * 32
     assert result["views"][0]["border_pixels"] == (border_pixels(labels) & mask).sum()
     assert sum(row["pixels"] for row in result["blocks"]) == 48 * 32
@@ -335,7 +357,7 @@ def test_masked_pixels_change_nothing(tmp_path: Path):
 def test_the_block_alone_is_measured_where_it_is_shown(tmp_path: Path):
     """A block's own render may be anything elsewhere."""
     camera = CAMERAS[0]
-    labels = block_label_map(plane_depth(camera), camera, quadrants())
+    labels = block_label_map(plane_depth(camera), camera, quadrant_at)
     plane = Plane([camera])
 
     def own_place_only(index: int, camera: Camera) -> Raster:

@@ -14,7 +14,7 @@ from support.hand_made_models import opaque_plane
 from support.viewer_scene import PLACE
 from vdgs.geometry.camera import Camera
 from vdgs.rendering.camera_paths import look_at_pose
-from vdgs.viewer import navigation, overlays
+from vdgs.viewer import navigation, overlays, viewer_scene
 from vdgs.viewer.layers import DisplayOptions, Painter
 from vdgs.viewer.measure_panel import MeasurePanel
 from vdgs.viewer.measurement import MeasuredPoint, Ruler
@@ -53,6 +53,15 @@ def test_a_place_knows_who_sees_it_and_what_stands_between(scene):
     assert above.coordinates[0] == "east 0.30, north -0.20, up 1.50 m (ground frame)"
     latitude, longitude = (float(part.strip(" °")) for part in above.coordinates[1].split(",")[:2])
     assert (latitude, longitude) == pytest.approx(PLACE[:2], abs=1e-5)
+
+
+def test_blocks_are_those_that_the_scene_was_merged_from(scene, monkeypatch):
+    """Which with rule `max-visibility` are not always the owners."""
+    monkeypatch.setattr(viewer_scene, "block_lookup", lambda run, blocks: lambda places: np.full(len(places), 1))
+    seen = ViewerScene(scene.run, scene._open)
+    seen.__dict__["blocks"] = scene.blocks
+    assert pick_point(seen, "merged", np.array([0.3, -0.2, 1.5])).block == 1
+    assert len(seen.block_tint("merged").unique(dim=0)) == 1
 
 
 def test_what_has_faded_is_neither_met_nor_measured_nor_compared(scene):

@@ -597,5 +597,6 @@ def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
         shown = open_run_or_checkpoint(cut)
         assert shown.name == "training"
         assert "1 of 2 blocks" in shown.warning
+        assert shown.missing_blocks == (0,)
         assert len(shown.model.anchors) > 0
         assert "**block 1**" in run_status_markdown(RunFolder(cut))

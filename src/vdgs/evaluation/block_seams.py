@@ -53,7 +53,7 @@ from vdgs.evaluation.renderable_model import ReferenceViews
 from vdgs.evaluation.view_exposures import apply_exposure_numpy
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
-from vdgs.partition.blocks import Blocks
+from vdgs.partition.merging import BlockLookup
 from vdgs.system.atomic_files import to_jsonable, write_json
 from vdgs.system.documents import BlockMetricsDocument, JsonObject
 from vdgs.system.stop_signals import check_stop_requested
@@ -87,7 +87,8 @@ class SeamView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlockInputs:
-    """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one.
+    """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one by
+    `block_at`, which says of which of the `num_blocks` blocks the merged scene is made at a point.
     `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
     it was not trained. All are measured in the exposure of the view, as in `RenderableModel`."""
 
@@ -95,7 +96,8 @@ class BlockInputs:
     render_coarse: Callable[[Camera], Raster]
     render_merged: Callable[[Camera], Raster]
     render_block: Callable[[int, Camera], Raster | None]
-    blocks: Blocks
+    num_blocks: int
+    block_at: BlockLookup
     exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
 
     def to_image(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
@@ -128,7 +130,7 @@ def evaluate_blocks(inputs: BlockInputs, output: Path) -> BlockMetricsDocument:
         shown = [shown[index] for index in select_seam_views([each.border_pixel_count for each in shown])]
     for each in shown:
         save_seam_image(output / "seams" / f"{each.stem}.png", each)
-    return summarize_blocks(measured, len(inputs.blocks), output)
+    return summarize_blocks(measured, inputs.num_blocks, output)
 
 
 def select_seam_views(border_pixels: Sequence[int]) -> list[int]:
@@ -158,10 +160,10 @@ def summarize_blocks(per_view_metrics: Iterable[BlockViewMetrics], blocks: int, 
 
 def measure_block_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockViewMetrics, SeamView]:
     """Measure a view: its figures, and what a seam image of it shows."""
-    by_block, seams = BlockMetrics(len(inputs.blocks), RENDER_NAMES), SeamMetrics()
+    by_block, seams = BlockMetrics(inputs.num_blocks, RENDER_NAMES), SeamMetrics()
     reference, mask = inputs.reference_views.load_image(view), inputs.reference_views.load_mask(view)
     drawn = inputs.render_merged(view.camera)
-    labels = block_label_map(drawn, view.camera, inputs.blocks)
+    labels = block_label_map(drawn, view.camera, inputs.block_at)
     coarse, merged = inputs.to_image(inputs.render_coarse(view.camera), view), inputs.to_image(drawn, view)
     squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
     isolated = _isolated_errors(view, labels, reference, inputs)
@@ -192,7 +194,7 @@ def _isolated_errors(
 ) -> Float[np.ndarray, "h w"]:
     """Squared error of each block's own render where the block is shown, NaN where there is none."""
     errors = np.full(labels.shape, np.nan)
-    for index in visible_blocks(labels, len(inputs.blocks)):
+    for index in visible_blocks(labels, inputs.num_blocks):
         rendered = inputs.render_block(index, view.camera)
         if rendered is not None:
             own = labels == index

@@ -1,6 +1,6 @@
 """Quality by block, and what the seams between blocks cost.
 
-Every pixel of a test view is labeled with the block that owns the point it shows. PSNR is pooled by block, and the
+Every pixel of a test view is labeled with the block that the point it shows was merged from. PSNR is pooled by block, and the
 error near the borders of the labels is compared with the error in the interior. The coarse model, which has no seams,
 is measured on the same pixels: borders may lie where images are hard to match anyway. Only sums stay in memory.
 """
@@ -12,27 +12,28 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int16
 
 from vdgs.evaluation.metrics import psnr_from_mse
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
-from vdgs.partition.blocks import Blocks
+from vdgs.partition.merging import BlockLookup
 from vdgs.system.documents import JsonObject
 
 #: Pixels this near to a change of label belong to the border.
 BORDER_PX = 10.0
 #: Less opaque pixels count as showing nothing: their depth says little.
 MIN_ALPHA = 0.5
-#: A block is measured in the views of which it owns at least this share: a sliver tells little and costs a render.
+#: A block is measured in the views of which it makes at least this share: a sliver tells little and costs a render.
 MIN_VIEW_SHARE = 0.005
 #: The label of a pixel where nothing is drawn.
 NO_BLOCK = -1
 
 
-def block_label_map(raster: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
-    """The block that owns the point that each pixel shows (its center at the median depth); NO_BLOCK where alpha is at
-    most one half. The expected depth would lie between roof and ground at the edge of a roof.
+def block_label_map(raster: Raster, camera: Camera, block_at: BlockLookup) -> Int16[np.ndarray, "h w"]:
+    """The block whose anchors are at the point that each pixel shows (its center at the median depth); NO_BLOCK where
+    alpha is at most one half. The expected depth would lie between roof and ground at the edge of a roof.
     Raises ValueError if the view was rendered without depth.
     """
     if raster.median_depth is None:
@@ -41,7 +42,7 @@ def block_label_map(raster: Raster, camera: Camera, blocks: Blocks) -> Int16[np.
     seen = alpha > MIN_ALPHA
     labels = np.full(alpha.shape, NO_BLOCK, np.int16)
     depth = raster.median_depth.double().cpu().numpy()[seen]
-    labels[seen] = blocks.owner(_unproject_pixels(np.argwhere(seen), depth, camera)[:, :2])
+    labels[seen] = block_at(torch.from_numpy(_unproject_pixels(np.argwhere(seen), depth, camera)))
     return labels
 
 
@@ -77,7 +78,7 @@ def border_pixels(labels: Int16[np.ndarray, "h w"], width_px: float = BORDER_PX)
 
 
 def visible_blocks(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
-    """The blocks that own at least MIN_VIEW_SHARE of the view."""
+    """The blocks that at least MIN_VIEW_SHARE of the view shows."""
     counts = np.bincount(labels[labels >= 0].astype(np.int64), minlength=blocks)
     return np.flatnonzero(counts >= max(1.0, MIN_VIEW_SHARE * labels.size)).tolist()
 

@@ -34,7 +34,7 @@ from vdgs.partition.block_regions import split_trainable_anchors
 from vdgs.partition.blocks import xy_positions
 from vdgs.runs.lod_folder import drawn_scene
 from vdgs.runs.model_integrity import load_verified
-from vdgs.runs.open_run import OpenedRun, load_run_blocks
+from vdgs.runs.open_run import OpenedRun, block_lookup, load_run_blocks
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.visibility_store import get_run_visibility
 
@@ -194,13 +194,14 @@ def make_true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View],
 def make_block_inputs(opened: OpenedRun, coarse: OpenedRun, images: ReferenceViews) -> BlockInputs:
     """Where the pictures of a run's blocks come from; the merged model is the one that was opened."""
     run, merged = opened.folder, opened.model.without_local_exposure()
-    before = coarse.model.without_local_exposure()
+    before, blocks = coarse.model.without_local_exposure(), load_run_blocks(run)
     return BlockInputs(
         reference_views=images,
         render_coarse=lambda camera: render(before, camera, depth=True),
         render_merged=lambda camera: render(merged, camera, depth=True),
         render_block=IsolatedBlocks(run, before).render,
-        blocks=load_run_blocks(run),
+        num_blocks=len(blocks),
+        block_at=block_lookup(opened, blocks),
         exposure=make_exposures(opened.model, opened.capture),
     )  # fmt: skip
 

@@ -28,6 +28,9 @@ from vdgs.partition.merge_checks import AnchorOrigins
 from vdgs.system.quoting import shell_word
 from vdgs.visibility.visibility_counts import count_visibility
 
+#: The block [n] int64 that a scene has its anchors from at each of some points [n, 3].
+BlockLookup = Callable[[Float[Tensor, "n 3"]], Int64[np.ndarray, " n"]]
+
 
 def merge_blocks(
     coarse: AnchorModel,
@@ -114,19 +117,25 @@ def block_of_points(
 
     `owner`: the owner. `max-visibility`: among the blocks that reach the point, the one whose cameras see it most; of
     equals the owner, else the first. A `missing` block keeps what it owns, and gets nothing more. O(n) memory.
+    Cameras are counted only where more than one block reaches: elsewhere the owner stays.
     """
     points = xy_positions(positions)
     owner = blocks.owner(points)
     if config.rule == "owner":
         return owner
-    source = owner.copy()
+    source, open_to_others = owner.copy(), ~np.isin(owner, missing)
+    reached_by = {
+        index: np.flatnonzero(blocks.in_expanded(index, points, owner) & (owner != index) & open_to_others)
+        for index in range(len(blocks))
+        if index not in missing
+    }
+    contested = np.unique(np.concatenate([np.zeros(0, np.int64), *reached_by.values()]))
     most = np.full(len(points), -1, np.int64)
     # The owner is counted first and others must see strictly more: of equals it keeps the place.
-    for index in range(len(blocks)):
-        rows = np.flatnonzero(owner == index)
+    for index in np.unique(owner[contested]).tolist():
+        rows = contested[owner[contested] == index]
         most[rows] = _visibility(positions, rows, cameras_of_block[index])
-    for index in (each for each in range(len(blocks)) if each not in missing):
-        rows = np.flatnonzero(blocks.in_expanded(index, points, owner) & (owner != index) & ~np.isin(owner, missing))
+    for index, rows in reached_by.items():
         visibility = _visibility(positions, rows, cameras_of_block[index])
         better = visibility > most[rows]
         source[rows[better]], most[rows[better]] = index, visibility[better]
@@ -135,7 +144,7 @@ def block_of_points(
 
 def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """V_i of the given rows over these cameras."""
-    return count_visibility(positions[torch.from_numpy(rows)], cameras).numpy()
+    return count_visibility(positions[torch.from_numpy(rows)], cameras).cpu().numpy()
 
 
 def _concatenate(parts: Sequence[dict[str, Tensor]]) -> Anchors:

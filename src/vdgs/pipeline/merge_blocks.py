@@ -14,7 +14,7 @@ from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.merging import merge_blocks
 from vdgs.runs.model_integrity import load_verified
-from vdgs.runs.open_run import OpenedRun, all_block_view_indices, load_run_blocks
+from vdgs.runs.open_run import OpenedRun, all_block_cameras, load_run_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import get_run_status
@@ -52,8 +52,7 @@ def merge_run_blocks(context: RunContext, allow_missing_blocks: bool, console: C
         start = time.monotonic()
         opened = context.open_model("coarse")
         coarse = _with_reference_exposure(opened, run.method(), console)
-        views = opened.capture.train_views
-        cameras = [[views[i].camera for i in indices] for indices in all_block_view_indices(run, opened.capture)]
+        cameras = all_block_cameras(run, opened.capture)
         trained = [
             partial(load_verified, folder, keys.blocks, index) if done[index] else None
             for index, folder in enumerate(folders)

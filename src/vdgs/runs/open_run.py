@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ from vdgs.captures.capture_metadata import check_same_capture
 from vdgs.captures.loading import load_capture
 from vdgs.config.commands import ModelName
 from vdgs.errors import CaptureError, RunError
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.assignment.score_file import load_scores
-from vdgs.partition.blocks import Blocks, load_blocks
+from vdgs.partition.blocks import Blocks, load_blocks, xy_positions
+from vdgs.partition.merging import BlockLookup, block_of_points
 from vdgs.runs.model_integrity import load_verified, map_verified
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import RunStatus, get_run_status
@@ -39,6 +42,8 @@ class OpenedModel:
     key: str
     #: Why it is not the model that one would expect (no merged one, or one that is out of date); empty where it is.
     warning: str
+    #: The blocks that coarse anchors stand in for; None for a model that is not put together from blocks.
+    missing_blocks: tuple[int, ...] | None = None
 
     @property
     def summary(self) -> str:
@@ -113,9 +118,11 @@ class ModelLocation:
 
     def opened(self, folder: RunFolder, model: AnchorModel) -> OpenedModel:
         """The same with the model that was read of it."""
+        status = self.stage.status()
+        missing = tuple(index for index, block in enumerate(status.block_models or ()) if block is None)
         return OpenedModel(
-            folder=folder, model=model, model_path=self.stage.model, name=self.name, status=self.stage.status(),
-            key=self.key, warning=self.warning,
+            folder=folder, model=model, model_path=self.stage.model, name=self.name, status=status, key=self.key,
+            warning=self.warning, missing_blocks=missing if self.name == "merged" else None,
         )  # fmt: skip
 
 
@@ -215,3 +222,20 @@ def all_block_view_indices(run: RunFolder, capture: Capture) -> list[list[int]]:
     if len(assignment.cameras) != len(capture.train_views):
         raise RunError(f"{file}: is of another capture. Run: vdgs partition {shell_word(run.path)}")
     return [np.flatnonzero(of_block).tolist() for of_block in assignment.cameras.T]
+
+
+def all_block_cameras(run: RunFolder, capture: Capture) -> list[list[Camera]]:
+    """The cameras of the training views that serve each block. Raises what `all_block_view_indices` raises."""
+    views = capture.train_views
+    return [[views[index].camera for index in indices] for indices in all_block_view_indices(run, capture)]
+
+
+def block_lookup(opened: OpenedRun, blocks: Blocks) -> BlockLookup:
+    """Says which block of a run's cut an opened model has its anchors from at a point: by the rule that it was merged
+    by, and by owner for a model that is not put together from blocks. Raises what `all_block_view_indices` raises."""
+    if opened.missing_blocks is None or (config := opened.folder.method().merge).rule == "owner":
+        return lambda positions: blocks.owner(xy_positions(positions))
+    return partial(
+        block_of_points, blocks=blocks, cameras_of_block=all_block_cameras(opened.folder, opened.capture),
+        config=config, missing=opened.missing_blocks,
+    )  # fmt: skip

@@ -218,7 +218,7 @@ def _draw_divider(image: np.ndarray, edge: int) -> UInt8[np.ndarray, "h w 3"]:
 
 @torch.no_grad()
 def _render_block_tints(model: Drawable, tints: Tensor, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
-    """The scene with the colors of the blocks that own its anchors."""
+    """The scene with the colors of the blocks that its anchors are from."""
     rows, splats = view_splats(model, camera)
     tint = tints.to(rows.device)[rows]
     colors = (1 - _TINT_STRENGTH) * splats.colors.mean(dim=1, keepdim=True) + _TINT_STRENGTH * tint

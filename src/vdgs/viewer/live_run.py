@@ -17,7 +17,7 @@ from vdgs.runs.lod_folder import has_lod
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import (
     OpenedRun,
-    all_block_view_indices,
+    all_block_cameras,
     load_run_blocks,
     locate_model,
     open_capture,
@@ -123,13 +123,14 @@ def _with_trained_blocks(coarse: OpenedRun) -> OpenedRun | None:
         trained.append(_load_block_so_far(coarse, run.block(index), keys.blocks, index, own))
     if not any(trained):
         return None
-    views = coarse.capture.train_views
-    cameras = [[views[view].camera for view in of_block] for of_block in all_block_view_indices(run, coarse.capture)]
+    cameras = all_block_cameras(run, coarse.capture)
     model = coarse.model.to(torch.device("cpu"))
     merged, _ = merge_blocks(model, trained, blocks, cameras, run.method().merge, allow_missing=True)
-    shown = sum(each is not None for each in trained)
+    missing = tuple(index for index, each in enumerate(trained) if each is None)
+    shown = len(trained) - len(missing)
     why = f"this is the scene as {shown} of {len(blocks)} blocks have it so far; elsewhere it is the coarse model"
-    return replace(coarse, model=merged.to(coarse.device), name=UNFINISHED_MODEL, warning=why)
+    model = merged.to(coarse.device)
+    return replace(coarse, model=model, name=UNFINISHED_MODEL, warning=why, missing_blocks=missing)
 
 
 def _load_block_so_far(

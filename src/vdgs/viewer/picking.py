@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
 from vdgs.geometry.camera import Camera
@@ -48,7 +49,7 @@ class PickedPoint:
     position: Float[np.ndarray, "3"]
     #: V: training cameras whose pictures it lies in.
     visibility: int
-    #: The block that owns it; None where the scene is not cut.
+    #: The block whose anchors the model has there; None where the scene is not cut.
     block: int | None
     #: All photographs that it lies in, the test views too: unoccluded ones first, then the nearest.
     hits: tuple[ImageHit, ...]
@@ -83,7 +84,8 @@ def pick_point(
         if view.camera.in_frustum(position[None])[0]
     ]
     visibility = sum(views[hit.index].split == "train" for hit in hits)
-    block = None if scene.blocks is None else int(scene.blocks.owner(position[None, :2])[0])
+    block_at = scene.block_lookup(name)
+    block = None if block_at is None else int(block_at(torch.from_numpy(position[None]))[0])
     hits.sort(key=lambda hit: (not hit.unoccluded, hit.ground_sampling))
     return PickedPoint(position, visibility, block, tuple(hits), coordinate_lines(scene, position))
 

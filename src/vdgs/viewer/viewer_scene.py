@@ -24,10 +24,11 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.lod_scene import LodScene, NodeContent, Places
 from vdgs.model.lod_tree import ANCHOR_COST, LodTree
 from vdgs.model.renderer import Drawable, render
-from vdgs.partition.blocks import Blocks, xy_positions
+from vdgs.partition.blocks import Blocks
+from vdgs.partition.merging import BlockLookup
 from vdgs.partition.plots.block_colors import block_color
 from vdgs.runs.lod_folder import find_tree
-from vdgs.runs.open_run import OpenedRun, load_run_blocks, open_run
+from vdgs.runs.open_run import OpenedRun, block_lookup, load_run_blocks, open_run
 from vdgs.runs.visibility_store import get_run_visibility, with_fade
 from vdgs.viewer.lod import LodLevel, LodPyramid
 from vdgs.viewer.navigation import CameraPose, overview_pose
@@ -61,6 +62,7 @@ class ViewerScene:
         self._runs: dict[str, OpenedRun] = {run.name: run}
         self._visibility: dict[str, Tensor] = {}
         self._block_tints: dict[str, Tensor] = {}
+        self._block_lookups: dict[str, BlockLookup] = {}
         #: By model, and by how many cameras must see an anchor; of each model the last few such numbers.
         self._levels: dict[str, dict[int, LodPyramid]] = {}
         self._trees: dict[str, LodScene | None] = {}
@@ -181,7 +183,7 @@ class ViewerScene:
     def level_tint(self, name: str, level: LodLevel, camera: Camera) -> Tensor:
         """The colors of the blocks of what a level draws in a view."""
         if isinstance(level.model, LodScene):
-            return level.model.values(camera, partial(self._node_values, f"{name} blocks", self._tint))
+            return level.model.values(camera, partial(self._node_values, f"{name} blocks", partial(self._tint, name)))
         return level.of(self.block_tint(name))
 
     def visibility_sample(self, name: str) -> Float[Tensor, " n"]:
@@ -207,6 +209,7 @@ class ViewerScene:
         self.run = run
         self._runs = {run.name: run}
         self._visibility, self._block_tints, self._levels, self._exposures = {}, {}, {}, {}
+        self._block_lookups = {}
         self._trees, self._faded_trees, self._detailed_trees, self._values = {}, {}, {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
@@ -240,17 +243,30 @@ class ViewerScene:
             return None
 
     def block_tint(self, name: str) -> Float[Tensor, "n 3"]:
-        """The color of the block that owns each anchor, RGB in 0 to 1; gray where the scene is not cut."""
+        """The color of the block that each anchor is from, RGB in 0 to 1; gray where the scene is not cut."""
         if name not in self._block_tints:
-            self._block_tints[name] = self._tint(self.model(name).anchors.positions)
+            self._block_tints[name] = self._tint(name, self.model(name).anchors.positions)
         return self._block_tints[name]
 
-    def _tint(self, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def block_lookup(self, name: str) -> BlockLookup | None:
+        """Which block a model has its anchors from at a point; None before the run is cut, and where that cannot be
+        read."""
         if self.blocks is None:
+            return None
+        if name not in self._block_lookups:
+            try:
+                self._block_lookups[name] = block_lookup(self.get_run(name), self.blocks)
+            except VdgsError:
+                return None
+        return self._block_lookups[name]
+
+    def _tint(self, name: str, places: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        block_at = self.block_lookup(name)
+        if self.blocks is None or block_at is None:
             colors = np.full((len(places), 3), 0.6)
         else:
             palette = np.stack([block_rgb(index) for index in range(len(self.blocks))])
-            colors = palette[self.blocks.owner(xy_positions(places))] / 255.0
+            colors = palette[block_at(places)] / 255.0
         return torch.as_tensor(colors, dtype=torch.float32, device=places.device)
 
     @cached_property
