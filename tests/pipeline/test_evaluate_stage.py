@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -13,9 +15,11 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.executor_options import CheckpointOptions
 from vdgs.config.method import MethodConfig, ModelConfig, TrainConfig
 from vdgs.evaluation.measured_as import is_evaluated
+from vdgs.model.lod_format import TREE_FILE
 from vdgs.pipeline import evaluate_stage as stage
 from vdgs.pipeline.train_coarse import train_coarse
 from vdgs.runs.create_or_resume import create_or_resume_run
+from vdgs.runs.lod_status import lod_folder
 from vdgs.runs.run_context import RunContext
 from vdgs.system.atomic_files import read_json
 
@@ -67,3 +71,37 @@ def test_photographs_from_where_nobody_flew_are_measured_when_they_come_or_chang
         assert not stage.is_off_path_measured(context, "coarse")
         measure(context)
         assert stage.is_off_path_measured(context, "coarse")
+
+
+def shards_folder(context: RunContext, **asked: Any) -> Path:
+    """Where shards leave what they have measured: figures of anything else lie elsewhere."""
+    request = stage.EvaluationRequest(path=context.run.path, which="coarse", **asked)
+    return stage._Evaluation.create(request).job(context.capture).folder
+
+
+def test_figures_of_off_path_views_that_were_replaced_are_not_joined_and_not_kept(trained):
+    write_off_path(trained.capture.root, 32)
+    context = RunContext.from_path(trained.run.path)
+    measure(context)
+    of_test, of_street = shards_folder(context), shards_folder(context, views="off-path")
+    photograph = context.capture.off_path_views[0].image_path
+    content = photograph.read_bytes()
+    photograph.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))  # another of the same size
+    os.utime(photograph, ns=(0, 0))
+    assert not stage.is_off_path_measured(context, "coarse")
+    assert shards_folder(context, views="off-path") != of_street
+    assert shards_folder(context) == of_test
+
+
+def test_figures_through_a_tree_are_not_joined_with_those_of_another(trained):
+    folder = lod_folder(trained.run)
+    folder.reset_unless("key")
+    (folder.path / TREE_FILE).write_bytes(b"nodes")
+    found = [shards_folder(trained), shards_folder(trained, lod_error=1.0), shards_folder(trained, lod_error=2.0)]
+    (folder.path / TREE_FILE).write_bytes(b"other nodes")
+    found.append(shards_folder(trained, lod_error=1.0))
+    folder.reset_unless("of other settings")
+    (folder.path / TREE_FILE).write_bytes(b"other nodes")
+    found.append(shards_folder(trained, lod_error=1.0))
+    assert len(set(found)) == len(found)
+    assert shards_folder(trained, lod_error=1.0) == found[-1]

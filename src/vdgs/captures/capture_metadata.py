@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from vdgs.captures.capture import Capture, View
+from vdgs.captures.ground_truth import has_ground_truth, load_ground_truth
+from vdgs.captures.off_path import OFF_PATH_FOLDER
 from vdgs.errors import RunError
 from vdgs.system.documents import CaptureMetadata
 
@@ -39,7 +41,7 @@ def capture_fingerprint(capture: Capture) -> dict[str, int]:
     5000 take half a second; of 1.5 MB each, which is much for a mask, 7 s. Without masks there is no part of theirs."""
     parts = {
         "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
-        "photographs": photographs_crc(capture.views),
+        "photographs": _photographs_crc(capture.views),
         "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
         "sparse points": _crc(capture.points.tobytes(), capture.point_colors.tobytes()),
     }
@@ -48,9 +50,23 @@ def capture_fingerprint(capture: Capture) -> dict[str, int]:
     return parts
 
 
-def photographs_crc(views: Sequence[View]) -> int:
+def _photographs_crc(views: Sequence[View]) -> int:
     """CRC-32 of photographs by their names and sizes in bytes."""
     return _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in views))
+
+
+def off_path_crc(capture: Capture) -> int:
+    """CRC-32 of all that figures of the off-path views depend on beside the model: names, cameras, and what the files of
+    photographs, masks and truth hold. They may change while a run stays as it is, since they never train; and they are
+    few, so that they are read."""
+    folder, parts = capture.root / OFF_PATH_FOLDER, list[str | bytes]()
+    truth = load_ground_truth(folder) if has_ground_truth(folder) else None
+    for view in capture.off_path_views:
+        of_truth = [] if truth is None else truth.files(view.name)
+        of_mask = [] if view.mask_path is None else [view.mask_path]
+        contents = [[_content_crc(file) for file in files] for files in ([view.image_path], of_mask, of_truth)]
+        parts += [f"{view.name}:{contents}", _camera_bytes(view)]
+    return _crc(f"truth {truth is not None}", *parts)
 
 
 def check_same_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:

@@ -54,13 +54,17 @@ class GroundTruth:
         stored = _read(self._file("views", name), ("depth", "visibility"))
         return np.where(stored["depth"] == 0, np.nan, stored["visibility"]).astype(np.float32)
 
+    def files(self, name: str) -> list[Path]:
+        """The files that hold the truth of a photograph."""
+        return [file for kind in ("views", "depth") if (file := self._file(kind, name)).is_file()]
+
     def depth_map(self, view: View) -> Float[np.ndarray, "h w"]:
         """The true depth in metres at the size at which the view is used (nearest pixel); inf for sky."""
         return self._at_size(self.depth(view.name), view.camera)
 
     def has_depth(self, view: View) -> bool:
         """Whether this photograph's depth was written."""
-        return any(self._file(kind, view.name).is_file() for kind in ("views", "depth"))
+        return bool(self.files(view.name))
 
     def visibility_map(self, view: View) -> Float[np.ndarray, "h w"]:
         """The true visibility at the size at which the view is used (nearest pixel)."""

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.captures.capture import View
-from vdgs.captures.capture_metadata import photographs_crc
+from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture_metadata import off_path_crc
 from vdgs.captures.off_path import OFF_PATH_FOLDER
 from vdgs.config.commands import ModelName
 from vdgs.distributed.job_folders import clear
@@ -49,6 +49,7 @@ from vdgs.evaluation.measured_as import EvaluationSplit, evaluation_folder, expo
 from vdgs.evaluation.renderable_model import EvaluatedModel, EvaluationSettings
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
 from vdgs.evaluation.view_metrics_io import load_view_metrics, save_view_metrics
+from vdgs.runs.lod_folder import tree_id
 from vdgs.runs.open_run import ModelLocation, OpenedRun, load_run_blocks, locate_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
@@ -118,7 +119,7 @@ class _Evaluation:
             (self.output / stale).unlink(missing_ok=True)
         shutil.rmtree(self.output / "seams", ignore_errors=True)
 
-    def job(self, view_count: int) -> ShardedJob:
+    def job(self, capture: Capture) -> ShardedJob:
         """The views in shards, and what their figures depend on."""
         run, model, request = self.run, self.model, self.request
         weights = None if request.lpips_weights is None else Path(os.path.abspath(request.lpips_weights))
@@ -128,10 +129,12 @@ class _Evaluation:
             model.stage.status().model_id, model.key, run.coarse_model_id(), blocks, str(weights), request.views
         ]  # fmt: skip
         if request.lod_error is not None:
-            depends_on.append(f"{request.lod_error}")
+            depends_on += [f"{request.lod_error}", tree_id(run)]
+        if request.views == "off-path":  # other views are those that the model was trained beside
+            depends_on.append(off_path_crc(capture))
         if exposure := exposure_mode(run):
             depends_on.append(exposure)
-        spans = split_ranges(view_count, *SHARD_VIEWS)
+        spans = split_ranges(len(select_views(capture, request.views)), *SHARD_VIEWS)
         return ShardedJob.create("views", request, self.output, VIEW_LABELS, depends_on, spans)
 
     def shard_bytes(self, views: Sequence[View]) -> int:
@@ -168,7 +171,7 @@ def evaluate_stage(
     # Before: a merge meanwhile makes another model, and figures that are out of date.
     record = measured_as(run, model.name, request.lpips_weights, request.visibility_bins)
     if request.views == "off-path":
-        record["photographs"] = photographs_crc(context.capture.off_path_views)
+        record["off_path"] = off_path_crc(context.capture)
     start = time.monotonic()
     if execution is not None and execution.is_distributed:
         peak = _evaluate_in_shards(context, evaluation, execution, console)
@@ -184,11 +187,10 @@ def evaluate_stage(
 
 
 def is_off_path_measured(context: RunContext, name: ModelName) -> bool:
-    """Whether the photographs from where nobody flew are those that a model was measured on, if there are any: they may
-    be added or replaced after the training, which does without them."""
-    views = context.capture.off_path_views
+    """Whether the views from where nobody flew, their truth too, are those that a model was measured on, if there are
+    any: they may be added or replaced after the training, which does without them."""
     record = read_json_or_empty(evaluation_folder(context.run, name, "off-path") / "status.json")
-    return not views or record.get("photographs") == photographs_crc(views)
+    return not context.capture.off_path_views or record.get("off_path") == off_path_crc(context.capture)
 
 
 def _evaluate_here(context: RunContext, evaluation: _Evaluation, console: Console) -> int:
@@ -222,7 +224,7 @@ def _evaluate_in_shards(
     context.release_models()
     run, views = evaluation.run, select_views(context.capture, evaluation.request.views)
     require_views(views, evaluation.output)
-    job = evaluation.job(len(views))
+    job = evaluation.job(context.capture)
     files = [run.config_file, run.coarse.model, evaluation.model.stage.model, *image_and_mask_files(views)]
     with lock_folder(evaluation.output), job.exclusive():
         evaluation.begin(len(views), console)
@@ -239,7 +241,7 @@ def measure_shard(shard: Shard) -> None:
     request, context = evaluation.request, RunContext.from_path(evaluation.request.path)
     opened, coarse = _open(context, request, shard.device)
     views = select_views(opened.capture, request.views)
-    job = evaluation.job(len(views))
+    job = evaluation.job(opened.capture)
 
     def results(left: Sequence[int]) -> Results:
         with cached_reference_views(views) as images:

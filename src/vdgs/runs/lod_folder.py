@@ -14,6 +14,7 @@ from vdgs.runs.lod_status import is_of_present_version, lod_folder
 from vdgs.runs.open_run import ModelLocation, OpenedModel, locate_model, open_mapped
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.quoting import shell_word
+from vdgs.system.tensors import file_id
 
 
 def has_lod(run: RunFolder, location: ModelLocation) -> bool:
@@ -22,6 +23,14 @@ def has_lod(run: RunFolder, location: ModelLocation) -> bool:
     status = folder.status()
     of_model = status.state == "done" and status.model_id == location.stage.status().model_id
     return of_model and (folder.path / TREE_FILE).exists() and is_of_present_version(run)
+
+
+def tree_id(run: RunFolder) -> str:
+    """What tells the tree of a run from any other: its key, which names the model and the settings that it was made
+    with, and the table of its nodes; empty where there is no finished one."""
+    folder = lod_folder(run)
+    table = folder.path / TREE_FILE
+    return f"{folder.key()} {file_id(table)}" if table.exists() else ""
 
 
 def find_tree(opened: OpenedModel) -> LodScene | None:

@@ -84,8 +84,8 @@ class MeasuredAs(TypedDict, total=False):
     lpips_weights: str
     bins: int
     exposed: str | None
-    #: CRC-32 of the photographs, of those from where nobody flew.
-    photographs: int
+    #: CRC-32 of the views from where nobody flew and their truth, where those are measured.
+    off_path: int
 
 
 class StageStatusDocument(TypedDict):
