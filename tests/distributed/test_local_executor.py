@@ -136,6 +136,19 @@ def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
     assert "at most 1 at once" in text
 
 
+def test_each_of_several_that_memory_ended_at_once_is_one_of_those_that_the_system_counts(monkeypatch):
+    """Three were killed between two polls, two of them for want of memory."""
+    kills = iter([5, 7, 7, 7])
+    monkeypatch.setattr(local_executor, "oom_kill_count", lambda: next(kills))
+    engine = local_executor._LocalEngine()
+    killed = Task(name="block 00", command=["sh", "-c", "kill -9 $$"], output=Path(os.devnull))
+    attempts = [attempt for attempt in engine.start([(killed, 1)] * 3) if not isinstance(attempt, OSError)]
+    for attempt in attempts:
+        attempt._process.wait()
+    ends = [attempt.poll() for attempt in attempts]
+    assert [(end.code, end.out_of_memory) for end in ends if end] == [(-9, True), (-9, True), (-9, False)]
+
+
 @pytest.mark.parametrize("content", [b"", b'{"sta', b"\xff\xfe\x00", b"[1, 2]", b"[" * 100_000, b'{"state": 3}'])
 def test_a_damaged_status_file_is_no_reason_to_fall(tmp_path, content):
     script = f'(folder / "status.json").write_bytes({content[:50]!r}); os._exit(9)'

@@ -26,7 +26,8 @@ class _LocalEngine:
     max_memory_bytes = None
 
     def __init__(self) -> None:
-        self._oom_kills = oom_kill_count()
+        #: What the system has counted, and how many of these kills no task has accounted for.
+        self._oom_kills, self._unclaimed_kills = oom_kill_count(), 0
 
     def start(self, tasks: Sequence[tuple[Task, int]]) -> list[_LocalAttempt | OSError]:
         return [self._start(task, attempt) for task, attempt in tasks]
@@ -43,10 +44,15 @@ class _LocalEngine:
     def refresh(self) -> None:
         """`poll` asks the system itself."""
 
-    def memory_ran_out(self) -> bool:
-        """Whether the system has ended processes for want of memory since the last call."""
+    def claim_memory_kill(self) -> bool:
+        """Whether a task that was killed was so for want of memory: each takes one of the kills that the system counts,
+        which it does before the process ends. Several may end between two polls."""
         before, self._oom_kills = self._oom_kills, oom_kill_count()
-        return self._oom_kills > before
+        self._unclaimed_kills += max(0, self._oom_kills - before)
+        if not self._unclaimed_kills:
+            return False
+        self._unclaimed_kills -= 1
+        return True
 
 
 class _LocalAttempt:
@@ -59,4 +65,4 @@ class _LocalAttempt:
         code = self._process.poll()
         if code is None:
             return None
-        return AttemptResult(code, out_of_memory=code == -signal.SIGKILL and self._engine.memory_ran_out())
+        return AttemptResult(code, out_of_memory=code == -signal.SIGKILL and self._engine.claim_memory_kill())
