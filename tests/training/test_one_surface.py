@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -72,16 +73,23 @@ def test_training_with_it_draws_splats_to_one_depth() -> None:
     assert spread(1.0) < 0.7 * spread(0.0)
 
 
-def test_every_second_step_counts_it_twice_and_the_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("weight", "part"), [(1.0, 1.0), (3.0, 0.5)])
+def test_every_second_step_counts_it_twice_and_the_others_do_not(
+    monkeypatch: pytest.MonkeyPatch, weight: float, part: float
+) -> None:
+    """In the unit of the rest of the loss: as it is, however much the step weighs and whatever part of a photograph it
+    draws."""
+    stepped, whole = MagicMock(), training_loop.make_target
+    stepped.weight.return_value, stepped.decoder_gradients.return_value = weight, {}
+    monkeypatch.setattr(training_loop, "make_target", lambda *of: replace(whole(*of), valid_fraction=part))
+
     def one(raster: Raster, *_: object) -> DepthAgreement:
         return DepthAgreement(torch.tensor(1.0), torch.zeros_like(raster.alpha), torch.zeros_like(raster.alpha))
 
-    def losses(weight: float) -> list[float]:
-        stage, state = block_stage(BlockConfig())
-        stage, found = (
-            replace(stage, config=replace(stage.config, loss=LossConfig(depth_agreement=weight))),
-            list[float](),
-        )
+    def losses(agreement: float) -> list[float]:
+        (stage, state), found = block_stage(BlockConfig()), list[float]()
+        config = replace(stage.config, loss=LossConfig(depth_agreement=agreement))
+        stage = replace(stage, config=config, guidance=stepped)
         train(state, stage, stop=lambda: len(found) == 4, after_step=lambda _, step: found.append(step.loss))
         return found
 

@@ -243,12 +243,14 @@ def image_index_at(stage: TrainingProblem, view: int) -> int:
 def _weighted_agreement(
     drawn: RenderedTrainingView, stage: TrainingProblem, iteration: int, target: TrainingTarget
 ) -> DepthAgreement | None:
-    """The loss of depths and its gradients, scaled to the whole photograph; None where none is due."""
+    """The loss of depths, and its gradients scaled to the whole photograph and by the weight of the step, as
+    `compute_loss` has them of the image; None where none is due."""
+    of_loss = AGREEMENT_EVERY * stage.config.loss.depth_agreement
     weight = AGREEMENT_EVERY * stage.loss_weight * stage.config.loss.depth_agreement * target.valid_fraction
     if not (weight and is_agreement_due(stage.config, iteration) and len(drawn.source)):
         return None
     found = depth_agreement(drawn.raster, stage.camera_height, target.mask)
-    return DepthAgreement(*(weight * part for part in found))
+    return DepthAgreement(of_loss * found.loss, weight * found.alpha, weight * found.depth)
 
 
 def _volume_weight(stage: TrainingProblem) -> float:
