@@ -15,6 +15,7 @@ from vdgs.geometry.camera import Camera
 from vdgs.partition.partition_scene import choose_block_count
 from vdgs.pipeline.train_blocks import _block_bytes
 from vdgs.runs.run_folder import RunFolder
+from vdgs.system.memory.memory_estimate import train_bytes_per_pixel
 
 
 def test_the_number_of_blocks() -> None:
@@ -39,7 +40,7 @@ def test_a_block_by_memory_takes_at_most_that_in_training(
     preset: str, offsets: int, pixels: int, limits: dict[str, int]
 ) -> None:
     """By the estimate of the stage that trains it: its growth, its limits of anchors, its mean, its picture."""
-    anchors, gb = 10**6, 1 + 150e-9 * pixels + 1.3 * offsets / 10
+    anchors, gb = 10**6, 1 + train_bytes_per_pixel(PRESETS[preset].training) / 1e9 * pixels + 1.3 * offsets / 10
     method = PRESETS[preset]
     growth = replace(method.block.densify, max_anchors=limits.get("max_anchors", 0))
     block = replace(method.block, densify=growth, max_anchors_total=limits.get("max_anchors_total", 0))
@@ -64,9 +65,9 @@ def test_more_growth_asks_for_more_blocks_and_limits_of_anchors_for_fewer() -> N
     auto, paper = PartitionConfig(blocks="auto"), PRESETS["default"]
 
     def count(block: BlockConfig) -> int:
-        return choose_block_count(10**6, 50_000, 10**6, MethodConfig(partition=auto, block=block))
+        return choose_block_count(2 * 10**6, 50_000, 10**6, MethodConfig(partition=auto, block=block))
 
     plain = replace(paper.block, compensation=replace(paper.block.compensation, enabled=False))
-    limited = replace(paper.block, max_anchors_total=10**6)
+    limited = replace(paper.block, max_anchors_total=2 * 10**6)
     assert count(paper.block) > count(plain) > count(limited)
     assert count(replace(plain, swa_fraction=0.5)) > count(plain)

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import vdgs
-from vdgs.config.method import CompensationConfig
+from vdgs.config.method import CompensationConfig, LossConfig, TrainConfig
 from vdgs.config.presets import PRESETS
 from vdgs.geometry.camera import Camera
 from vdgs.system.memory.memory_errors import is_out_of_memory
@@ -37,6 +37,7 @@ from vdgs.system.memory.memory_estimate import (
     max_growth_factor,
     max_image_pixels,
     memory_advice,
+    train_bytes_per_pixel,
 )
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.training.session import memory_advice as memory_advice_module
@@ -85,12 +86,30 @@ def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with()
     assert max_image_pixels(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
     assert max_image_pixels(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
     default, laptop = (block_workload(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("default", "laptop"))
-    assert estimate_memory(laptop).image == 150 * 5472 * 3648
+    assert (estimate_memory(laptop).image, estimate_memory(default).image) == (175 * 5472 * 3648, 80 * 5472 * 3648)
     assert (laptop.has_swa, default.has_swa) == (True, False)
     assert (laptop.max_grown_anchors, default.max_grown_anchors) == (150_000, 750_000)
     assert laptop.surroundings == 350_000
     paper = block_workload(PRESETS["paper"], 50_000, 400_000, 5472 * 3648)  # whose margin moves, too
     assert (paper.anchors, paper.surroundings) == (98_000, 302_000)
+
+
+def test_what_a_step_draws_decides_what_a_pixel_takes():
+    """Measured of five steps of 6 megapixels; and the photographs that are decoded in advance, 3 bytes each."""
+    ahead = 4 * 3
+    for exposure, depth, pseudo, sky, measured in (
+        (False, 0.0, 0.0, False, 65),
+        (True, 0.0, 0.0, False, 86),
+        (False, 0.05, 0.0, False, 105),
+        (True, 0.05, 0.0, False, 125),
+        (False, 0.0, 0.3, False, 141),
+        (True, 0.0, 0.3, False, 154),
+        (True, 0.05, 0.3, False, 166),
+        (False, 0.0, 0.0, True, 158),
+    ):
+        loss = LossConfig(depth_agreement=depth, pseudo_views=pseudo)
+        found = train_bytes_per_pixel(TrainConfig(loss=loss, exposure_compensation=exposure), sky)
+        assert found == pytest.approx(measured + ahead, rel=0.08)
 
 
 def test_growth_below_a_fixed_threshold_is_expected_to_be_large():
@@ -155,7 +174,7 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
         ),
         3 * 10**9,
     )
-    assert line.startswith("memory by estimate: 872 MB at the start, 1.04 GB at most (photographs 200 MB")
+    assert line.startswith("memory by estimate: 802 MB at the start, 975 MB at most (photographs 200 MB")
     assert line.endswith("this process may take 3.00 GB")
 
 
@@ -168,7 +187,13 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
 )
 def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
     need = TrainingWorkload(
-        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, image_cache_bytes=10**9
+        anchors=1_000_000,
+        max_anchors=0,
+        offsets=10,
+        seen=0.4,
+        pixels=2 * 10**7,
+        pixel_bytes=150,
+        image_cache_bytes=10**9,
     )
     taken = psutil.Process().memory_info().rss  # it grows with the tests that ran before
     monkeypatch.setattr(memory_advice_module, "available_memory_bytes", lambda: int(5.4e9) - taken)

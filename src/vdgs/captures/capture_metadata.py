@@ -56,9 +56,9 @@ def _photographs_crc(views: Sequence[View]) -> int:
 
 
 def off_path_crc(capture: Capture) -> int:
-    """CRC-32 of all that figures of the off-path views depend on beside the model: names, cameras, and what the files of
-    photographs, masks and truth hold. They may change while a run stays as it is, since they never train; and they are
-    few, so that they are read."""
+    """CRC-32 of all that figures of the off-path views depend on beside the model: names, cameras, and what the files
+    of photographs, masks and truth hold. They may change while a run stays as it is, since they never train. They are
+    few: they are read."""
     folder, parts = capture.root / OFF_PATH_FOLDER, list[str | bytes]()
     truth = load_ground_truth(folder) if has_ground_truth(folder) else None
     for view in capture.off_path_views:

@@ -1,8 +1,8 @@
 """Quality by block, and what the seams between blocks cost.
 
-Every pixel of a test view is labeled with the block that the point it shows was merged from. PSNR is pooled by block, and the
-error near the borders of the labels is compared with the error in the interior. The coarse model, which has no seams,
-is measured on the same pixels: borders may lie where images are hard to match anyway. Only sums stay in memory.
+Every pixel of a test view is labeled with the block that the point it shows was merged from. PSNR is pooled by block,
+and the error near the borders of the labels is compared with the error in the interior. The coarse model, which has no
+seams, is measured on the same pixels: borders may lie where images are hard to match anyway. Only sums stay in memory.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ class _Evaluation:
         if request.lod_error is not None:
             depends_on += [f"{request.lod_error}", tree_id(run)]
         if request.views == "off-path":  # other views are those that the model was trained beside
-            depends_on.append(off_path_crc(capture))
+            depends_on.append(f"{off_path_crc(capture)}")
         if exposure := exposure_mode(run):
             depends_on.append(exposure)
         spans = split_ranges(len(select_views(capture, request.views)), *SHARD_VIEWS)

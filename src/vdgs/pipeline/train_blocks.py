@@ -17,6 +17,7 @@ from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.runs.model_integrity import map_verified
 from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.open_run import load_run_blocks
 from vdgs.runs.run_context import RunContext
@@ -61,8 +62,9 @@ def train_blocks(
             worker="block", request=options, folder=run.path / "blocks", kind=BLOCK_LABELS,
             spans=tuple(range(index, index + 1) for index in range(len(blocks))),
         )  # fmt: skip
+        has_sky = map_verified(run.coarse, run.keys().coarse).envmap is not None
         needs = ShardNeeds(
-            _block_bytes(run, cameras), lambda: NodeRequirements(run.path, files), decoded_image_bytes(cameras)
+            _block_bytes(run, cameras, has_sky), lambda: NodeRequirements(run.path, files), decoded_image_bytes(cameras)
         )
 
         def on_ready() -> None:
@@ -102,9 +104,9 @@ def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
             shutil.rmtree(folder.path)
 
 
-def _block_bytes(run: RunFolder, cameras: Sequence[Camera]) -> int:
+def _block_bytes(run: RunFolder, cameras: Sequence[Camera], has_sky: bool = False) -> int:
     """Memory by estimate that the largest block needs for the program, its image, its anchors once they have grown, and
-    those around it. Cached images have a budget of their own."""
+    those around it; `has_sky`: before an environment map. Cached images have a budget of their own."""
     method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
     pixels = max_image_pixels(cameras, method.block.resolution_schedule)
-    return estimate_memory(block_workload(method, max(anchors), sum(anchors), pixels)).total
+    return estimate_memory(block_workload(method, max(anchors), sum(anchors), pixels, has_sky)).total

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from vdgs.config.method import CompensationConfig, MethodConfig, ResolutionSchedule, max_block_anchors
+from vdgs.config.method import CompensationConfig, MethodConfig, ResolutionSchedule, TrainConfig, max_block_anchors
 from vdgs.geometry.camera import Camera
 from vdgs.system.units import data_size
 
@@ -18,8 +18,15 @@ TrainingKind = Literal["coarse", "block"]
 
 #: A process of vdgs with everything imported.
 PROCESS_BYTES = 350_000_000
-#: The picture being trained on: itself, its gradient, its target, what the rasterizer notes, the next ones in advance.
-TRAIN_BYTES_PER_PIXEL = 150
+#: The picture being trained on: itself, its gradient, its target, what the rasterizer notes (65 measured), and the
+#: next four photographs in advance.
+TRAIN_BYTES_PER_PIXEL = 80
+#: ... more where exposures are fitted, where depths are compared, and instead of that with pseudo views, which are
+#: drawn beside a picture with depth (21, 40 and 76 measured).
+EXPOSURE_BYTES_PER_PIXEL, DEPTH_BYTES_PER_PIXEL, PSEUDO_VIEW_BYTES_PER_PIXEL = 20, 40, 75
+#: ... more where photographs show sky before an environment map: 160 for a pixel of sky (measured), of half of a
+#: picture (choice).
+SKY_BYTES_PER_PIXEL = 80
 #: What a step makes of an anchor in view, for each of its Gaussians (measured with ten: 1.55 kB an anchor).
 STEP_BYTES_PER_OFFSET = 155
 #: An image that is evaluated: maps of errors and of V in double precision; LPIPS's widest layer (choice: not measured).
@@ -48,6 +55,8 @@ class TrainingWorkload:
     seen: float
     #: Pixels of the largest photograph.
     pixels: int
+    #: What a step takes for each of them: `train_bytes_per_pixel`.
+    pixel_bytes: int = TRAIN_BYTES_PER_PIXEL
     #: Decoded photographs that are kept.
     image_cache_bytes: int
     #: Anchors that are drawn but never move.
@@ -102,6 +111,16 @@ def max_growth_factor(config: CompensationConfig) -> float:
     return MAX_COMPENSATED_GROWTH if config.enabled and not config.t_low_quantile else MAX_GROWTH
 
 
+def train_bytes_per_pixel(config: TrainConfig, has_sky: bool = False) -> int:
+    """What a step takes for each pixel of its photograph; `has_sky`: an environment map is drawn behind."""
+    loss, more = config.loss, SKY_BYTES_PER_PIXEL if has_sky else 0
+    if loss.pseudo_views:
+        more += PSEUDO_VIEW_BYTES_PER_PIXEL
+    elif loss.depth_agreement:
+        more += DEPTH_BYTES_PER_PIXEL
+    return TRAIN_BYTES_PER_PIXEL + more + (EXPOSURE_BYTES_PER_PIXEL if config.exposure_compensation else 0)
+
+
 def max_image_pixels(cameras: Iterable[Camera], resolutions: ResolutionSchedule) -> int:
     """Pixels of the largest photograph, at the largest size that a resolution schedule gives it."""
     factor = min(factor for _, factor in resolutions)
@@ -113,10 +132,12 @@ def decoded_image_bytes(cameras: Iterable[Camera]) -> int:
     return 3 * sum(camera.width * camera.height for camera in cameras) * 4 // 3
 
 
-def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixels: int) -> TrainingWorkload:
+def block_workload(
+    method: MethodConfig, anchors: int, total_anchors: int, pixels: int, has_sky: bool = False
+) -> TrainingWorkload:
     """The workload of a block with `anchors` of all coarse anchors and photographs of up to `pixels`, before it is
-    opened and without cached photographs. A crop may be a whole photograph. A margin that moves is trained, too: about
-    the share by which the expansion makes a disc larger."""
+    opened and without cached photographs; `has_sky` as in `train_bytes_per_pixel`. A crop may be a whole photograph. A
+    margin that moves is trained, too: about the share by which the expansion makes a disc larger."""
     block, moved = method.block, anchors
     if block.margin != "frozen":
         moved = min(total_anchors, math.ceil(anchors * (1 + method.partition.expansion) ** 2))
@@ -126,6 +147,7 @@ def block_workload(method: MethodConfig, anchors: int, total_anchors: int, pixel
         offsets=method.training.model.num_offsets,
         seen=MAX_VISIBLE_FRACTION,
         pixels=pixels,
+        pixel_bytes=train_bytes_per_pixel(method.training, has_sky),
         image_cache_bytes=0,
         surroundings=total_anchors - moved,
         has_swa=block.swa_fraction > 0,
@@ -159,7 +181,7 @@ def estimate_memory(need: TrainingWorkload) -> MemoryEstimate:
     frozen = need.surroundings * (model_bytes_per_anchor(need.offsets) + in_view)
     start = bytes_per_anchor(need.offsets, need.seen, need.is_compensated) * need.anchors
     return MemoryEstimate(
-        PROCESS_BYTES, need.image_cache_bytes, TRAIN_BYTES_PER_PIXEL * need.pixels,
+        PROCESS_BYTES, need.image_cache_bytes, need.pixel_bytes * need.pixels,
         round(start + frozen), round(_per_grown_anchor(need) * need.max_grown_anchors + frozen),
     )  # fmt: skip
 

@@ -19,6 +19,7 @@ from vdgs.system.memory.memory_estimate import (
     max_growth_factor,
     max_image_pixels,
     memory_advice,
+    train_bytes_per_pixel,
 )
 from vdgs.system.memory.process_memory import available_memory_bytes
 from vdgs.system.units import data_size
@@ -45,6 +46,7 @@ def training_workload(state: TrainingState, stage: TrainingProblem) -> TrainingW
         offsets=anchors.offsets.shape[1],
         seen=max(seen) / max(len(anchors), 1),
         pixels=max_image_pixels(cameras, config.resolution_schedule),
+        pixel_bytes=train_bytes_per_pixel(config, state.decoder.envmap is not None and stage.sky_masks is not None),
         image_cache_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.frozen_anchors is None else len(stage.frozen_anchors.anchors),
         has_swa=config.swa_fraction > 0,
