@@ -265,4 +265,4 @@ def _are_degrees(rows: Sequence[Row], known: Mapping[str, int]) -> bool:
 
 
 def _has_numbers(row: Row) -> bool:
-    return len(row.words) > 2 and all(math.isfinite(number_of(word)) for word in row.words[1:3])
+    return len(row.words) > 2 and all(math.isfinite(number_of(word.replace(",", "."))) for word in row.words[1:3])
