@@ -372,6 +372,9 @@ UTM = "EPSG:32632\nname;x;y;alt\na.jpg;{};{};{}\n"
         (UTM.format("489.334", "4.330.123", "1.634"), 1634),
         (UTM.format("489334", "4330123", "1634,5 m\nb.jpg;489334;4330123;1,634 m"), 1634.5),
         ("a.jpg 39.12345 -105.1 1,634\n", 1634),
+        ('a.jpg,39.12345,-105.1,"1,634.5 m"\n', 1634.5),
+        ("a.jpg;39.12345;-105.1;1'634 m\n", 1634),
+        ('EPSG:32632\na.jpg,"489.334,1","4.330.123,2","1.634,5"\n', 1634.5),
     ],
 )
 def test_a_comma_before_three_digits_is_what_the_table_shows(tmp_path, table, altitude):
@@ -385,6 +388,8 @@ def test_a_comma_before_three_digits_is_what_the_table_shows(tmp_path, table, al
         (UTM.format("489334", "4330123", "1,634"), "the altitude may be 1634 or 1.634,"),
         (UTM.format("489,334", "4330123", "1634"), "a coordinate may be 489334 or 489.334,"),
         (DEGREES.format("39,12345", "-105,1", "1.634"), "the altitude may be 1634 or 1.634,"),
+        ("a.jpg;39,12345;-105,1;1.634\n", "the altitude may be 1634 or 1.634,"),
+        ("EPSG:32632\na.jpg;489,334;4330123;1634\n", "a coordinate may be 489334 or 489.334,"),
     ],
 )
 def test_numbers_that_may_be_thousands_or_decimals_are_refused(tmp_path, table, said):

@@ -12,7 +12,7 @@ from itertools import zip_longest
 _EITHER = re.compile(r"[+-]?[1-9]\d{0,2}([.,])\d{3}")
 _DECIMAL = re.compile(r"[+-]?\d*([.,])\d+")
 #: Signs between thousands: of several, or in front of a decimal sign.
-_GROUPED = re.compile(r"[+-]?\d{1,3}(?:(?:(,)\d{3})+(?:(\.)\d+|,\d{3})|(?:(\.)\d{3})+(?:(,)\d+|\.\d{3}))")
+_GROUPED = re.compile(r"[+-]?\d{1,3}(?:(?:(,)\d{3})+(?:\.\d+|,\d{3})|(?:(\.)\d{3})+(?:,\d+|\.\d{3}))")
 #: A number, and a unit behind it as in `1,636 m Above Sea Level`.
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+)((?:\s*(?:m|ft|feet|foot|met(?:er|re)s?)\b[\w ]*)?)", re.IGNORECASE)
 
@@ -29,9 +29,9 @@ class _Shown:
         match = _WITH_UNIT.fullmatch(word)
         number = match[1] if match else ""
         if grouped := _GROUPED.fullmatch(number):
-            comma, point_behind, point, comma_behind = grouped.groups()
-            self.thousands |= {comma or point}
-            self.decimal |= {point_behind or comma_behind} - {None}
+            sign = grouped[1] or grouped[2]
+            self.thousands.add(sign)
+            self.decimal.add("." if sign == "," else ",")
         elif (alone := _DECIMAL.fullmatch(number)) and not may_be_thousands(number, most):
             self.decimal |= {alone[1]}
 

@@ -69,6 +69,8 @@ _NMEA = re.compile(r"\d{4,5}\.\d+")
 _MRK = re.compile(r"([-\d.]+),Lat\s+([-\d.]+),Lon\s+([-\d.]+),Ellh")
 #: Coordinates of local systems are smaller, in metres, and those of projected ones larger (choice).
 _LARGEST_LOCAL = 20_000.0
+#: How large numbers can be in columns that no heading names: name x y altitude.
+_LARGEST_BY_ORDER = {1: math.inf, 2: math.inf, 3: LARGEST_ALTITUDE}
 #: What columns say that have no heading.
 _NO_HEADING = Heading("", "", (), ())
 
@@ -119,7 +121,7 @@ def read_gps_table(file: Path) -> GpsTable:
     system, body = _system_and_body(lines)
     if not body:
         raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
-    all_rows = with_units(with_points_parted(rows_of(body)))
+    all_rows = with_units(with_points_parted(rows_of(body, _LARGEST_BY_ORDER)))
     columns, rows = read_columns(all_rows, system, file)
     if not rows:
         raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
@@ -347,7 +349,9 @@ def _altitude(row: Row, columns: Columns, file: Path) -> float:
     word = _word(row, columns, "alt")
     if word.lower() in UNKNOWN:
         return math.nan
-    word = plain_number(word)
+    digits = re.match(r"[^A-Za-z(]*", word)
+    bare = digits[0].rstrip() if digits else ""
+    word = plain_number(bare) + word[len(bare) :]
     number = _LEADING_NUMBER.match(word)
     behind = read_heading(f"({word[number.end() :]})") if number is not None else None
     if number is None or behind is None or behind.unread or {*behind.meanings} - {*LENGTHS, "sea", "ellipsoid", ""}:
