@@ -349,6 +349,55 @@ def test_signs_between_thousands_are_read_where_they_are_clear(tmp_path, x, y):
         assert read_gps_table(tmp_path / "t.csv").rows[0].position[:2] == read_gps_table(plain).rows[0].position[:2]
 
 
+DEGREES = "name;lat;lon;alt\na.jpg;{};{};{}\n"
+UTM = "EPSG:32632\nname;x;y;alt\na.jpg;{};{};{}\n"
+
+
+@pytest.mark.parametrize(
+    ("table", "altitude"),
+    [
+        ('name,lat,lon,alt\na.jpg,39.12345,-105.1,"1,634"\n', 1634),
+        ('name,lat,lon,alt\na.jpg,39.12345,-105.1,"1,634 m Above Sea Level"\n', 1634),
+        ('name,lat,lon,alt_ft\na.jpg,39.12345,-105.1,"5,361"\n', 1634.0328),
+        ('name,lat,lon,alt\na.jpg,"39,12345","-105,1","1,634"\n', 1.634),
+        ('name,lat,lon,alt\na.jpg,39,-105,"1,634"\n', 1634),  # commas part the words
+        ('EPSG:32632\nname,x,y,z\na.jpg,"489,334","4,330,123","1,634"\n', 1634),
+        (DEGREES.format("39.12345", "-105.1", "1,634"), 1634),
+        (DEGREES.format("39.12345", "-105.1", "1,634\nb.jpg;39.12345;-105.1;412,5"), 1.634),  # the column counts first
+        (DEGREES.format("39,12345", "-105,1", "1,634"), 1.634),
+        (DEGREES.format("39,123", "-105,124", "1,634"), 1.634),  # no angle has thousands
+        (DEGREES.format("39,12345", "-105,1", "1.634\nb.jpg;39,12345;-105,1;1.634,5"), 1634),
+        (DEGREES.format("39,12345", "-105,1", "412.523"), 412.523),
+        (UTM.format("489334", "4330123", "412,523"), 412.523),  # 412 km is no altitude
+        (UTM.format("489.334", "4.330.123", "1.634"), 1634),
+        (UTM.format("489334", "4330123", "1634,5 m\nb.jpg;489334;4330123;1,634 m"), 1634.5),
+        ("a.jpg 39.12345 -105.1 1,634\n", 1634),
+        ('a.jpg,39.12345,-105.1,"1,634.5 m"\n', 1634.5),
+        ("a.jpg;39.12345;-105.1;1'634 m\n", 1634),
+        ('EPSG:32632\na.jpg,"489.334,1","4.330.123,2","1.634,5"\n', 1634.5),
+    ],
+)
+def test_a_comma_before_three_digits_is_what_the_table_shows(tmp_path, table, altitude):
+    (tmp_path / "t.csv").write_text(table)
+    assert read_gps_table(tmp_path / "t.csv").rows[0].position[2] == pytest.approx(altitude)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        (UTM.format("489334", "4330123", "1,634"), "the altitude may be 1634 or 1.634,"),
+        (UTM.format("489,334", "4330123", "1634"), "a coordinate may be 489334 or 489.334,"),
+        (DEGREES.format("39,12345", "-105,1", "1.634"), "the altitude may be 1634 or 1.634,"),
+        ("a.jpg;39,12345;-105,1;1.634\n", "the altitude may be 1634 or 1.634,"),
+        ("EPSG:32632\na.jpg;489,334;4330123;1634\n", "a coordinate may be 489334 or 489.334,"),
+    ],
+)
+def test_numbers_that_may_be_thousands_or_decimals_are_refused(tmp_path, table, said):
+    (tmp_path / "t.csv").write_text(table)
+    with pytest.raises(CaptureError, match=said):
+        read_gps_table(tmp_path / "t.csv")
+
+
 @pytest.mark.parametrize(
     "columns",
     [

@@ -105,7 +105,13 @@ def test_hemispheres_and_units_of_angles_are_read_wherever_they_are_said(tmp_pat
 
 @pytest.mark.parametrize(
     ("head", "row", "said"),
-    [("lat (DDMMSS.ss),lon (DDMMSS.ss)", "-33.30,-70.36", "in one number"), ("lat,lon", "33.5 S,70.6 O", "O is west")],
+    [
+        ("lat (DDMMSS.ss),lon (DDMMSS.ss)", "-33.30,-70.36", "in one number"),
+        ("lat,lon", "33.5 S,70.6 O", "O is west"),
+        ("lat,N/S,lon,E/W", "-33.5,N,70.6,W", "latitude -33.5 N: its sign says S, its side N"),
+        ("lat,N/S,lon,E/W", "-33.5,S,-7036.0000,E", "longitude -7036.0000 E: its sign says W"),
+        ("lat,lon", "-33.5 S,-70.6 E", "longitude -70.6 E: its sign says W"),
+    ],
 )
 def test_angles_that_may_mean_two_things_are_refused(tmp_path, head, row, said):
     (file := tmp_path / "t.csv").write_text(f"name,{head}\na.jpg,{row}\n")

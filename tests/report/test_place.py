@@ -14,7 +14,7 @@ from PIL import Image
 from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.captures.capture_dates import date_taken, first_and_last
+from vdgs.captures.capture_dates import date_taken, exif_form, first_and_last, time_of
 from vdgs.captures.loading import load_capture
 from vdgs.captures.place_facts import measure_place
 from vdgs.captures.place_record import PlaceFacts, format_area, format_flown, place_rows, place_summary
@@ -175,6 +175,15 @@ def test_when_a_place_was_flown(tmp_path):
     assert format_flown(flown) == "2026-06-23, 16:31 to 16:40 by the camera's clock"
     assert format_flown(("2026-06-23 16:31", "2026-06-25 09:00")) == "2026-06-23 to 2026-06-25"
     assert first_and_last(["0000:00:00 00:00:00", "", "yesterday"]) == ()
+
+
+@pytest.mark.parametrize("moment", ["2026-06-23 16:31:59", "2026-06-23T16:31:59Z", "2026/06/23 16:31:59.25"])
+def test_dates_with_other_signs_are_those_of_exif(moment):
+    plain = "2026:06:23 16:31:59"
+    assert exif_form(moment)[:19] == plain
+    assert time_of(moment) == time_of(plain) is not None
+    assert first_and_last([moment]) == first_and_last([plain]) == ("2026-06-23 16:31",) * 2
+    assert (exif_form("a day"), time_of("2026-13-01 10:00:00")) == ("a day", None)
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from rich.console import Console
 
 pycolmap = pytest.importorskip("pycolmap")
 
-from vdgs.captures.reconstruction import CameraReport  # noqa: E402
-from vdgs.config.sfm_options import SfmOptions  # noqa: E402
+from vdgs.captures.reconstruction import CameraReport, read_digests  # noqa: E402
+from vdgs.config.sfm_options import SfmOptions, SfmRequest  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
 from vdgs.sfm import fisheyes, incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
@@ -21,7 +22,9 @@ from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
 from vdgs.sfm.focal_length import DIAGONAL_35_MM, Lens  # noqa: E402
 from vdgs.sfm.image_metadata import FISHEYE, RADIAL, attitude_from_gimbal  # noqa: E402
 from vdgs.sfm.incremental_mapper import CONTRADICTED  # noqa: E402
+from vdgs.sfm.reconstruction_plan import plan_reconstruction  # noqa: E402
 from vdgs.sfm.reconstruction_report import _warnings  # noqa: E402
+from vdgs.sfm.step_keys import step_keys  # noqa: E402
 from vdgs.sfm.workspace import Workspace, silence_colmap  # noqa: E402
 
 SIZE = 800, 600
@@ -160,6 +163,36 @@ def test_models_are_made_anew_with_fisheyes_once(tmp_path, monkeypatch, fails):
     if fails:
         with pytest.raises(CaptureError):
             mapping.map_photographs(plan, Workspace(tmp_path / "asked"), [GOPRO], "key", 6, console)
+    else:  # what was found by then does not count against what is said
+        mapping.map_photographs(plan, Workspace(tmp_path), [GOPRO], "key", 6, console)
+        assert mapper.keys[3:] == ["key"]
+        assert not Workspace(tmp_path).fisheyes_file.exists()
+
+
+def test_a_model_that_is_said_is_other_work_where_photographs_could_contradict_it(tmp_path):
+    """The note on a fisheye advises `--camera-model simple-radial`, which must then do something."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "GoPro", "HERO9 Black"
+    for name, mm in (("short", 16), ("long", 50)):
+        (tmp_path / name).mkdir()
+        exif.get_ifd(0x8769)[0xA405] = mm
+        for number in range(3):
+            Image.new("RGB", (400, 300), (80 * number, 0, 0)).save(tmp_path / name / f"{number}.jpg", exif=exif)
+    keys = {
+        (name, model): step_keys(
+            plan_reconstruction(
+                SfmRequest(
+                    image_folders=(tmp_path / name,), output=tmp_path / "out", options=SfmOptions(camera_model=model)
+                )
+            ),
+            read_digests(tmp_path / "out"),
+        )
+        for name in ("short", "long")
+        for model in ("auto", "simple-radial")
+    }
+    auto, told = keys["short", "auto"], keys["short", "simple-radial"]
+    assert [step for step in auto if auto[step] == told[step]] == ["features", "matches"]
+    assert keys["long", "auto"] == keys["long", "simple-radial"]
 
 
 @dataclass(frozen=True)

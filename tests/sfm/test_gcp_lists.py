@@ -17,6 +17,7 @@ from support.gcp_files import NAMES, PLACES, SURVEY_OFF, projected, write_list
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm.gcp_adjustment import triangulate
+from vdgs.sfm.gcp_lines import parse_line, read_rows
 from vdgs.sfm.gcp_list import (
     GcpList,
     GcpObservation,
@@ -134,6 +135,29 @@ def test_a_system_in_a_comment_and_decimal_commas_between_blanks_are_read(flight
     for rows in (["# of May", f"#{head}", *lines], ["# EPSG:4326", head, *lines], [head, *commas]):
         file.write_text("\n".join(rows))
         assert read_gcp_list(file, collection, ()).points == sound.points
+
+
+@pytest.mark.parametrize(
+    ("row", "place"),
+    [
+        ("489334.12 4330123.10 1,634 2000 1500 a.jpg p", (489334.12, 4330123.1, 1634)),
+        ("489,334.12\t4,330,123.10\t1,634\t2000\t1500\ta.jpg\tp", (489334.12, 4330123.1, 1634)),
+        ('"489,334","4,330,123","1,634","2,000",1500,a.jpg,p', (489334, 4330123, 1634)),
+        ("489,334 4,330,123 1,634 2000 1500 a.jpg p", (489334, 4330123, 1634)),
+        ("489334,12 4330123,10 1,634 2000 1500 a.jpg p", (489334.12, 4330123.1, 1.634)),
+        ("489334;4330123;412,523;2000;1500;a.jpg;p", (489334, 4330123, 412.523)),
+        ("489334;4330123;1,634;2000;1500;a.jpg;p", None),
+        ("489334,12;4330123,10;1.634;2000;1500;a.jpg;p", None),
+    ],
+)
+def test_a_comma_before_three_digits_is_what_the_list_shows(tmp_path, row, place):
+    (file := tmp_path / "gcp_list.txt").write_text(f"EPSG:32613\n{row}\n")
+    (found,) = read_rows(file)[1]
+    if place is None:
+        with pytest.raises(CaptureError, match=r"line 2: a number may be 1634 or 1\.634, and nothing"):
+            parse_line(found, file, 1.0)
+    else:
+        assert parse_line(found, file, 1.0).place == place
 
 
 SITE = (

@@ -14,10 +14,11 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked
 from vdgs.sfm.exif_gps import FLAT, VOID, is_measured_in_xmp
+from vdgs.sfm.flights import flights_of
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.image_metadata import ImageMetadata, attitude_from_gimbal, read_image_metadata
-from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.incremental_mapper import _over_slope, should_fix_focal
 from vdgs.sfm.map_datums import to_wgs84
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -263,3 +264,19 @@ def test_few_levels_are_not_altitudes_that_were_rounded(first, altitudes, seen):
         for k, each in enumerate(altitudes)
     ]
     assert read_gps_priors(photos, None, (1.0, 2.0)).altitude_step_m == seen
+
+
+def test_dates_with_hyphens_are_work_as_those_with_colons(tmp_path):
+    """Pauses part flights by them; copies of other programs have the same moments."""
+    seen = [tagged(tmp_path / f"{k}.jpg", k, 0, {0x9003: f"2026-06-01 {10 + 4 * (k // 3)}:00:{k:02d}"}, {})
+            for k in range(6)]  # fmt: skip
+    assert [photo.datetime for photo in seen[::5]] == ["2026:06:01 10:00:00", "2026:06:01 14:00:05"]
+    assert flights_of(seen).tolist() == [0, 0, 0, 1, 1, 1]
+
+
+@pytest.mark.parametrize("longitude", [178.0, 180.0])
+def test_a_slope_is_one_on_both_sides_of_the_antimeridian(first, longitude):
+    east = (longitude + np.linspace(-0.001, 0.001, 9) + 180) % 360 - 180
+    photos = [replace(first, lat_lon=(-16.8 + 1e-4 * (k % 3), float(each))) for k, each in enumerate(east)]
+    heights = 80 + 5.0 * np.arange(9)
+    assert _over_slope(heights, photos) == pytest.approx(np.zeros(9), abs=1e-6)

@@ -268,6 +268,15 @@ def test_some_of_many_points_tell_how_far_what_photographs_show_is(nine, capture
     assert max(measured) <= 50 < model.num_points3D()
 
 
+def test_what_a_pixel_changes_with_a_place_follows_lens_and_pose(capture):
+    model = pycolmap.Reconstruction(capture / MAPPED)
+    image = next(image for image in model.images.values() if image.has_pose)
+    place = model.points3D[image.points2D[image.get_observation_point2D_idxs()[0]].point3D_id].xyz
+    step = np.array([0.003, -0.002, 0.001])
+    moved = image.project_point(place + step) - image.project_point(place - step)
+    assert scale_bars._jacobian(model, image, place) @ step * 2 == pytest.approx(moved, rel=1e-3)
+
+
 BAD_BARS = {
     "nothing": ("", "names no distance"),
     "one photograph": ("A 10 10 DJI_0001.JPG\nB 20 20 DJI_0001.JPG\nA B 3", "A is marked in fewer than two"),

@@ -92,6 +92,8 @@ def test_xmp_says_what_exif_cuts_off_at_seconds():
         ({1: "O", 2: (33.0, 30.0, 0.0), 3: "O", 4: (70.0, 36.0, 0.0)}, "not understood (latitude"),
         ({2: (33.0, 30.0, 0.0), 4: (70.0, 36.0, 0.0)}, "no hemisphere (latitude S or N, longitude W or E)"),
         ({1: "S", 2: (33.0, 30.0, 0.0), 4: (70.0, 36.0, 0.0)}, "no hemisphere (longitude W or E)"),
+        ({1: "N", 2: (-33.5, 0.0, 0.0), 3: "W", 4: (-70.6, 0.0, 0.0)}, "not understood (latitude -33.5 0.0 0.0 N)"),
+        ({1: "S", 2: "33.5", 3: "E", 4: "-70.6"}, "not understood (longitude -70.6 E)"),
     ],
 )
 def test_what_is_there_but_not_understood_is_said(gps, said):
@@ -148,6 +150,8 @@ def test_altitudes_and_their_references(gps, altitude):
         ("33,5", 33.5),
         ("+0.1", 0.1),
         ("N 33 30 0", 33.5),
+        ("-33.5 S", -33.5),
+        ("-33.5 N", None),  # its sign and its side contradict each other
         ("33 minutes", 33),
         ("33?30'0\" N", 33.5),  # a program without the sign of degrees
         ("33.5?", None),

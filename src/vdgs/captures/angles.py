@@ -48,7 +48,8 @@ def degrees_of_parts(parts: Sequence[float | None]) -> float | None:
 def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     """Degrees from text such as `-33.5`, `33.5 S`, `33°30'1.5" South` or `33,30.02S`, and whether it says the side.
 
-    None for what is no such angle. A comma stands for the decimal point where it is the only one of its text.
+    None for what is no such angle, and where a minus sign contradicts the side (`-33.5 N`). A comma stands for the
+    decimal point where it is the only one of its text.
     """
     plain = _without_units(text)
     if any(sign.isalpha() and not sign.isascii() for sign in plain):  # of a script that is not read
@@ -63,10 +64,15 @@ def degrees_of_text(text: str, axis: str) -> tuple[float, bool] | None:
     value = _degrees_of_numbers(numbers)
     if value is None:
         return None
+    negative = says_minus(numbers)
     if side is not None:
-        return side * value, True
-    negative = numbers.lstrip().startswith(("-", "\u2212"))
+        return (side * value, True) if not (negative and value and side > 0) else None
     return (-value if negative else value), negative
+
+
+def says_minus(text: str) -> bool:
+    """Whether a text begins with a minus sign."""
+    return text.lstrip().startswith(("-", "\u2212"))
 
 
 def _without_units(text: str) -> str:

@@ -5,14 +5,28 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable
+from datetime import datetime
 from pathlib import Path
 
 from vdgs.captures.image_tags import read_tags
 from vdgs.errors import CaptureError
 
 _DATE_TAKEN, _DATE = 0x9003, 0x0132
-#: EXIF's form: 2026:06:23 16:31:59; some write hyphens.
-_FORM = re.compile(r"(\d{4})[:-](\d\d)[:-](\d\d)[ T](\d\d:\d\d)")
+#: EXIF's form: 2026:06:23 16:31:59; some programs write other signs (2026-06-23T16:31:59).
+_FORM = re.compile(r"(\d{4})[:/.-](\d\d)[:/.-](\d\d)[ T](\d\d:\d\d)")
+
+
+def exif_form(moment: str) -> str:
+    """A date and time with EXIF's signs, whatever signs a program wrote; other texts as they are."""
+    return _FORM.sub(r"\1:\2:\3 \4", moment, count=1) if _FORM.match(moment) else moment
+
+
+def time_of(moment: str) -> datetime | None:
+    """A date and time of EXIF to the second; None where it is none."""
+    try:
+        return datetime.strptime(exif_form(moment)[:19], "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
 
 
 def first_and_last(moments: Iterable[str]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from vdgs.captures.column_headings import Heading, read_heading
 from vdgs.captures.coordinate_systems import is_in_degrees, look_like_degrees, to_geodetic
+from vdgs.captures.decimal_signs import doubt_of
 from vdgs.captures.flight_extent import LOCAL_METERS, NO_LAND_DEG, why_no_flight
 from vdgs.captures.pose_texts import are_quaternions, has_local_places
 from vdgs.captures.system_names import is_local_system
@@ -265,4 +266,4 @@ def _are_degrees(rows: Sequence[Row], known: Mapping[str, int]) -> bool:
 
 
 def _has_numbers(row: Row) -> bool:
-    return len(row.words) > 2 and all(math.isfinite(number_of(word)) for word in row.words[1:3])
+    return len(row.words) > 2 and all(math.isfinite(number_of(word)) or doubt_of(word) for word in row.words[1:3])

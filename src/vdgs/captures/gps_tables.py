@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vdgs.captures.angles import degrees_of_text
+from vdgs.captures.angles import SIDES, degrees_of_text, says_minus
 from vdgs.captures.column_headings import LENGTHS, Heading, read_heading
 from vdgs.captures.column_units import believed_units, in_units_of, named_in_units
 from vdgs.captures.coordinate_systems import (
@@ -25,6 +25,7 @@ from vdgs.captures.coordinate_systems import (
     outside_area,
     to_geodetic,
 )
+from vdgs.captures.decimal_signs import doubt_of
 from vdgs.captures.flight_extent import LOCAL_METERS
 from vdgs.captures.gps_columns import BY_TIME, DEVIATIONS, Columns, HoldsPoses, read_columns
 from vdgs.captures.system_names import join_definition, names_a_system
@@ -39,7 +40,7 @@ from vdgs.captures.table_columns import (
     side_letter,
     with_units,
 )
-from vdgs.captures.text_tables import LOOKED_AT, Line, read_lines, rows_of, with_points_parted
+from vdgs.captures.text_tables import LARGEST_ALTITUDE, LOOKED_AT, Line, read_lines, rows_of, with_points_parted
 from vdgs.errors import CaptureError
 
 #: How files begin that have positions but are no tables of them, and what to do.
@@ -68,6 +69,8 @@ _NMEA = re.compile(r"\d{4,5}\.\d+")
 _MRK = re.compile(r"([-\d.]+),Lat\s+([-\d.]+),Lon\s+([-\d.]+),Ellh")
 #: Coordinates of local systems are smaller, in metres, and those of projected ones larger (choice).
 _LARGEST_LOCAL = 20_000.0
+#: How large numbers can be in columns that no heading names: name x y altitude.
+_LARGEST_BY_ORDER = {1: math.inf, 2: math.inf, 3: LARGEST_ALTITUDE}
 #: What columns say that have no heading.
 _NO_HEADING = Heading("", "", (), ())
 
@@ -118,7 +121,7 @@ def read_gps_table(file: Path) -> GpsTable:
     system, body = _system_and_body(lines)
     if not body:
         raise CaptureError(f"{file}: is empty. Write a first line `name,lat,lon,alt` and one for each photograph.")
-    all_rows = with_units(with_points_parted(rows_of(body)))
+    all_rows = with_units(with_points_parted(rows_of(body, _LARGEST_BY_ORDER)))
     columns, rows = read_columns(all_rows, system, file)
     if not rows:
         raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
@@ -266,12 +269,14 @@ def _other_degrees(latitude: float, longitude: float) -> str:
 
 def _angle(row: Row, columns: Columns, axis: _Axis, file: Path) -> float | None:
     """An angle of a row in the unit of its column; its own side counts before that of another column or the heading's.
-    Raises CaptureError for numbers that the heading says to be no decimal ones, for an O that may be either side, and
-    for words in a column of sides that are none.
+    Raises CaptureError for numbers that the heading says to be no decimal ones, for an O that may be either side, for
+    words in a column of sides that are none, and for a sign against a side.
     """
     where, heading = f"{file}: line {row.number}", columns.angles.get(axis.column, _NO_HEADING)
     word, side_word = _words_of_angle(row, columns, axis, where)
-    side_word = _side(side_word, axis, where) or heading.side
+    side_word = _side(side_word, axis, where)
+    _check_sign(word, side_word, axis, where)
+    side_word = side_word or heading.side
     try:
         number = float(word)
     except ValueError:
@@ -290,6 +295,18 @@ def _angle(row: Row, columns: Columns, axis: _Axis, file: Path) -> float | None:
         return None
     side = degrees_of_text(f"{abs(read[0])} {side_word}", axis.name)
     return side[0] if side is not None and side[1] else read[0]
+
+
+def _check_sign(word: str, side: str, axis: _Axis, where: str) -> None:
+    """Raise CaptureError for an angle below zero whose side, in its text or in its own column, is north or east."""
+    value = degrees_of_text(word.lstrip("-\u2212 "), axis.name) if says_minus(word) else None
+    if value is not None and value[0] > 0 and (value[1] or side in ("N", "E")):
+        one, other = SIDES[axis.name]
+        plain = word.lstrip("-\u2212 ").rstrip(f"{other} ")
+        raise CaptureError(
+            f"{where}: {axis.name} {word} {side}".rstrip()
+            + f": its sign says {one}, its side {other}. Write {plain} {one} or {plain} {other}."
+        )
 
 
 def _has_minutes(row: Row, columns: Columns) -> bool:
@@ -332,11 +349,15 @@ def _altitude(row: Row, columns: Columns, file: Path) -> float:
     word = _word(row, columns, "alt")
     if word.lower() in UNKNOWN:
         return math.nan
-    word = plain_number(word)
+    digits = re.match(r"[^A-Za-z(]*", word)
+    bare = digits[0].rstrip() if digits else ""
+    word = plain_number(bare) + word[len(bare) :]
     number = _LEADING_NUMBER.match(word)
     behind = read_heading(f"({word[number.end() :]})") if number is not None else None
     if number is None or behind is None or behind.unread or {*behind.meanings} - {*LENGTHS, "sea", "ellipsoid", ""}:
         raise CaptureError(f"{file}: line {row.number}: the altitude {word!r} is not a number. Mend the row.")
+    if doubt := doubt_of(number[1], LARGEST_ALTITUDE):
+        raise CaptureError(f"{file}: line {row.number}: the altitude {doubt}")
     value = float(number[1].replace(",", "."))
     if value in NO_DATA:
         return math.nan
@@ -353,6 +374,8 @@ def _projected(
         x, y = (number_of(_word(row, columns, what)) for what in ("x", "y"))
         if not (math.isfinite(x) and math.isfinite(y)):
             words = [_word(row, columns, what) for what in ("x", "y", "alt")]
+            if doubt := doubt_of(words[0]) or doubt_of(words[1]):
+                raise CaptureError(f"{file}: line {row.number}: a coordinate {doubt}")
             raise CaptureError(f"{file}: line {row.number}: {words} are not numbers. Mend the row.")
         places.append((x, y, _altitude(row, columns, file)))
     given = np.array(places)

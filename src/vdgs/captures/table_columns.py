@@ -81,9 +81,11 @@ _PICTURES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
 #: Names of columns of moments.
 _TIMES = re.compile(r"time|date|\butc|gpst|\btow\b|gpsweek|zeit|datum|hora|fecha|heure|时间|日期", re.IGNORECASE)
 FOOT_M = LENGTHS["ft"]
-#: Numbers with signs between thousands: 6,292,126.02 and 6.292.126,02; 350 000,12 (French) and 2'600'000.5 (Swiss).
+#: Numbers with signs between thousands: 6,292,126, 6,292,126.02 and 6.292.126,02; 350 000,12 (French) and 2'600'000.5
+#: (Swiss). What `6,292` is other numbers of a table tell (`decimal_signs`).
 _THOUSANDS = re.compile(
-    r"[+-]?\d{1,3}(?:(?:,\d{3})+\.\d+|(?:\.\d{3})+,\d+|(?:[ \u00a0\u202f\u2009'’]\d{3})+(?:[.,]\d+)?)"
+    r"[+-]?\d{1,3}(?:(?:,\d{3})+\.\d+|(?:\.\d{3})+,\d+|(?:,\d{3}){2,}|(?:\.\d{3}){2,}"
+    r"|(?:[ \u00a0\u202f\u2009'’]\d{3})+(?:[.,]\d+)?)"
 )
 #: Signs of other columns of numbers than altitudes: angles, speeds, counts.
 _OTHERS = re.compile(
@@ -314,4 +316,7 @@ def plain_number(word: str) -> str:
     one."""
     if not _THOUSANDS.fullmatch(word.strip()):
         return word
+    signs = re.sub(r"[^.,]", "", word)
+    if len(signs) > 1 and len({*signs}) == 1:  # 6,292,126
+        return re.sub(r"[.,]", "", word)
     return re.sub(r"[.,](?=.*[.,])|[^\d.,+-]", "", word).replace(",", ".")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import codecs
 import csv
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from vdgs.captures.decimal_signs import with_plain_numbers
 from vdgs.captures.table_columns import Row, known_columns
 from vdgs.errors import CaptureError
 
@@ -20,7 +22,15 @@ csv.field_size_limit(LONGEST_FILE)
 _SEPARATORS = ("\t", ";", ",", "|")
 #: Excel's line that says what parts words.
 _EXCEL = re.compile(r"\"?sep=.?\"?", re.IGNORECASE)
-_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+#: Numbers with commas, before decimals or between thousands.
+_COMMAS_IN_NUMBER = re.compile(r"[+-]?(?:\d+,\d+|\d{1,3}(?:,\d{3})+(?:\.\d+)?)")
+#: No angle in degrees is larger, nor an altitude or an accuracy of photographs, in metres or feet (choice).
+LARGEST_ALTITUDE = 20_000.0
+_LARGEST = {
+    **dict.fromkeys(("lat", "lon"), 360.0), "alt": LARGEST_ALTITUDE,
+    **dict.fromkeys(("across", "upwards", "eastwards", "northwards"), 1000.0),
+}  # fmt: skip
+_MEASURED = {*_LARGEST, "x", "y"}
 #: A photograph's name in front of a line whose words are parted by blanks, which may be in the name too.
 _NAME_WITH_BLANKS = re.compile(
     r"\s*([^\"#][^\"]*?\.(?:jpe?g|png|tiff?|webp|avif|dng|cr[23]|nef|arw|raf|orf|rw2|hei[cf]|hif))\s+(?=\S)",
@@ -115,8 +125,10 @@ def _decode_unicode(data: bytes) -> str | None:
     return None
 
 
-def rows_of(lines: Sequence[Line]) -> list[Row]:
-    """The lines as words, without quotes; decimal commas are points where the separator is another."""
+def rows_of(lines: Sequence[Line], largest: Mapping[int, float] | None = None) -> list[Row]:
+    """The lines as words, without quotes; numbers have points before decimals and no signs between thousands, as far as
+    others of the table tell what their signs are. `largest` says for columns of lengths and angles how large numbers
+    can be, if not names of columns in the first line."""
     separator = separator_of([line.text for line in lines[:LOOKED_AT]])
     rows = []
     for line in lines:
@@ -127,16 +139,17 @@ def rows_of(lines: Sequence[Line]) -> list[Row]:
             words += next(csv.reader([rest], delimiter=" ", skipinitialspace=True))
         else:
             words = next(csv.reader([line.text], delimiter=separator, skipinitialspace=True))
-        words = [word.strip().strip('"') for word in words]
-        if separator != ",":
-            words = with_decimal_points(words)
-        rows.append(Row(line.number, words))
-    return rows
+        rows.append(Row(line.number, [word.strip().strip('"') for word in words]))
+    if not rows:
+        return rows
+    most = _largest_numbers(rows[0].words) or largest or {}
+    plain = with_plain_numbers([row.words for row in rows], most, separator == ",")
+    return [Row(row.number, words) for row, words in zip(rows, plain, strict=True)]
 
 
-def with_decimal_points(words: Sequence[str]) -> list[str]:
-    """Words with a point for the decimal comma of those that are such numbers."""
-    return [word.replace(",", ".") if _DECIMAL_COMMA.fullmatch(word) else word for word in words]
+def _largest_numbers(words: Sequence[str]) -> dict[int, float]:
+    """How large numbers can be below these names of columns, as far as they are angles or lengths."""
+    return {k: _LARGEST.get(what, math.inf) for what, k in known_columns(words).items() if what in _MEASURED}
 
 
 def separator_of(lines: Sequence[str]) -> str | None:
@@ -145,15 +158,15 @@ def separator_of(lines: Sequence[str]) -> str | None:
         parted = (_POINT_BEGINS.subn("", line) for line in lines)
         counts = (line.count(separator) + points for line, points in parted)
         if sum(count >= 2 for count in counts) * 2 > len(lines):
-            return None if separator == "," and _has_decimal_commas_only(lines) else separator
+            return None if separator == "," and _has_commas_in_numbers_only(lines) else separator
     return None
 
 
-def _has_decimal_commas_only(lines: Sequence[str]) -> bool:
+def _has_commas_in_numbers_only(lines: Sequence[str]) -> bool:
     """Whether blanks part each line that has commas into three words or more, and commas stand in numbers alone."""
     parted = [line.split() for line in lines if "," in line]
     return all(
-        len(words) > 2 and all(_DECIMAL_COMMA.fullmatch(word) for word in words if "," in word) for words in parted
+        len(words) > 2 and all(_COMMAS_IN_NUMBER.fullmatch(word) for word in words if "," in word) for words in parted
     )
 
 

@@ -9,8 +9,9 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from vdgs.captures.capture_dates import time_of
 from vdgs.geometry.geodesy import enu_from_geodetic
-from vdgs.sfm.flights import time_key, time_of
+from vdgs.sfm.flights import time_key
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.system.units import first_names
 

@@ -102,7 +102,11 @@ def _of_both(place: Place, in_xmp: Place, is_sided: bool) -> tuple[Place | None,
 
 
 def _not_understood(gps: Mapping[int, Any], understood: Collection[str]) -> str:
-    shown = ", ".join(f"{axis} {_shown(gps.get(tag))}" for axis, (_, tag) in _TAGS.items() if axis not in understood)
+    shown = ", ".join(
+        f"{axis} {_shown(gps.get(tag))} {plain_text(gps.get(reference))}".rstrip()
+        for axis, (reference, tag) in _TAGS.items()
+        if axis not in understood
+    )
     return f"the position in EXIF is not understood ({shown})"
 
 
@@ -207,7 +211,8 @@ def _is_absolute_otherwise(value: float, absolute: float, xmp: Mapping[str, str]
 
 
 def _angle(gps: Mapping[int, Any], axis: str) -> tuple[float, bool] | None:
-    """Degrees, and whether the block says on which side of the equator or Greenwich they are."""
+    """Degrees, and whether the block says on which side of the equator or Greenwich they are; None for what is not
+    understood, or contradicts itself."""
     reference, tag = _TAGS[axis]
     value, word = gps.get(tag), plain_text(gps.get(reference))
     written = plain_text(value) if isinstance(value, str | bytes) else ""
@@ -224,7 +229,7 @@ def _angle(gps: Mapping[int, Any], axis: str) -> tuple[float, bool] | None:
         degrees, sided = known, known < 0
     if word:
         side = side_of(word, axis)
-        if side is None:
+        if side is None or (degrees < 0 < side):  # a sign against the side: neither is believed
             return None
         degrees, sided = side * abs(degrees), True
     return (degrees, sided) if abs(degrees) <= LIMITS[axis] else None

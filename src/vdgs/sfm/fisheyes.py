@@ -28,6 +28,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 
 #: Of lenses up to this 35 mm equivalent (mm; choice) some are fisheyes: those of action cameras have 12 to 17.
 MAX_FISHEYE_MM = 20.0
+#: A lens that tags say to be longer than this is none, however short a model that went astray has it (mm; choice).
+NO_FISHEYE_MM = 40.0
 #: A fisheye is taken where points lie nearer to where they are seen by this share (choice): its four terms bend a
 #: perspective lens as well as one radial term does, and somewhat better where that lens bends oddly.
 PLAINLY_NEARER = 0.25
@@ -56,9 +58,18 @@ def candidates(groups: Sequence[CameraGroup], model: pycolmap.Reconstruction | N
             focals.append(model.cameras[number].mean_focal_length())
         short = any(equivalent_mm(focal, group.width, group.height) <= MAX_FISHEYE_MM for focal in focals)
         named = not group.has_focal_prior and _ACTION_CAMERAS.search(group.camera) is not None
-        if group.model == RADIAL and (short or named):
+        if may_be_found([group]) and (short or named):
             found.append(number)
     return found
+
+
+def may_be_found(groups: Sequence[CameraGroup]) -> bool:
+    """Whether some model of their photographs could show one of these lenses to be a fisheye."""
+    return any(
+        group.model == RADIAL
+        and not (group.has_focal_prior and equivalent_mm(group.focal_px, group.width, group.height) > NO_FISHEYE_MM)
+        for group in groups
+    )
 
 
 def foretold(photographs: Sequence[ImageMetadata], options: SfmOptions) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vdgs.captures.capture_dates import time_of
 from vdgs.captures.capture_order import natural_key
 from vdgs.sfm.image_metadata import ImageMetadata
 
@@ -22,14 +23,6 @@ STEP_M, STEP_TIMES = 10.0, 8.0
 LEAST_PHOTOGRAPHS, LEAST_OFFSET_M, LEAST_SIGMAS = 3, 5.0, 4.0
 #: A receiver that states a better accuracy up (metres) has fixed its altitudes (RTK).
 FIXED_M = 0.5
-
-
-def time_of(text: str) -> datetime | None:
-    """EXIF's date and time; None where it is none."""
-    try:
-        return datetime.strptime(text[:19], "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        return None
 
 
 def time_key(photo: ImageMetadata, across_folders: bool = False) -> tuple[str, float, Any]:

@@ -8,13 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vdgs.captures.decimal_signs import doubt_of, with_plain_numbers
 from vdgs.captures.system_names import defines_a_system, join_definition, names_a_system
 from vdgs.captures.table_columns import NO_DATA, UNKNOWN, Row, known_columns, number_of, told_meters
-from vdgs.captures.text_tables import Line, read_lines, rows_of, separator_of, with_decimal_points
+from vdgs.captures.text_tables import LARGEST_ALTITUDE, Line, read_lines, rows_of, separator_of
 from vdgs.errors import CaptureError
 
 #: A line of the list, or of names of its columns, has so many words: x, y, z and a mark.
 _LEAST_WORDS = 5
+#: How large numbers of x, y and z can be.
+_LARGEST = {0: math.inf, 1: math.inf, 2: LARGEST_ALTITUDE}
 #: How names of photographs end.
 _PHOTOGRAPH = re.compile(r"\.(jpe?g|tiff?|png|dng|heic|webp)$", re.I)
 
@@ -41,9 +44,11 @@ def read_rows(file: Path) -> tuple[str, list[Row], tuple[float | None, float | N
     header, lines = Line(lines[0].number, text), lines[count:]
     rows = [Row(line.number, line.text.split()) for line in lines]
     if separator_of([line.text for line in lines]) is None:
-        rows = [Row(number, [*with_decimal_points(words[:5]), *words[5:]]) for number, words in rows]
+        plain = with_plain_numbers([row.words[:5] for row in rows], _LARGEST, commas_part=False)
+        rows = [Row(number, [*front, *words[5:]]) for (number, words), front in zip(rows, plain, strict=True)]
     else:
-        rows = [row if len(row.words) > 5 else plain for row, plain in zip(rows_of(lines), rows, strict=True)]
+        parted = rows_of(lines, _LARGEST)
+        rows = [row if len(row.words) > 5 else blanks for row, blanks in zip(parted, rows, strict=True)]
     if not rows or any(map(_is_number, rows[0].words[:5])):
         return header.text, rows, (None, None, None)
     _check_order(rows[0], file)
@@ -144,6 +149,11 @@ def _number(word: str) -> float:
     return float(word) if math.isnan(found) else found
 
 
+def _doubt(words: Sequence[str]) -> str:
+    """What to say of the first of a row's numbers that may be thousands or decimals; empty where there is none."""
+    return next(filter(None, map(doubt_of, words[:5])), "")
+
+
 def parse_line(row: Row, file: Path, height: float) -> GcpLine:
     """What a line says, its height times `height`."""
     number, words = row
@@ -152,6 +162,8 @@ def parse_line(row: Row, file: Path, height: float) -> GcpLine:
         x, y, z, across, down = map(_number, [*words[:2], "0" if flat else words[2], *words[3:5]])
         photograph = words[5].strip()
     except (ValueError, IndexError):
+        if doubt := _doubt(words):
+            raise CaptureError(f"{file}: line {number}: a number {doubt}") from None
         alone = " Surveyed points alone do not say where photographs show them." if len(words) < 6 else ""
         line = " ".join(words)[:80]
         alone = alone or " (nan for a height that is not known.)"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import UnidentifiedImageError
 
+from vdgs.captures.capture_dates import exif_form
 from vdgs.captures.image_files import MAX_IMAGE_PX, SUPPORTED_MODES
 from vdgs.captures.image_suffixes import TIFF_SUFFIXES
 from vdgs.captures.image_tags import ImageTags, read_tags
@@ -334,7 +335,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         camera=_camera(tags, details, xmp),
         lens=lens,
         focal_mm=zoomed_focal_mm(details),
-        datetime=plain_text(details.get(0x9003)) or plain_text(tags.get(0x0132)),
+        datetime=exif_form(plain_text(details.get(0x9003)) or plain_text(tags.get(0x0132))),
         subsecond=_subsecond(details),
         lat_lon=place,
         altitude=altitude,

@@ -161,6 +161,7 @@ def _over_slope(heights: np.ndarray, photographs: Sequence[ImageMetadata]) -> np
     places = np.array([photo.lat_lon or (np.nan, np.nan) for photo in photographs])
     if len(places) < MIN_FOR_SLOPE or not np.isfinite(places).all():
         return heights
+    places[:, 1] = places[0, 1] + (places[:, 1] - places[0, 1] + 180) % 360 - 180  # across 180°, too
     middle = places.mean(axis=0)
     away = (places - middle) * [1.0, np.cos(np.radians(middle[0]))]
     terms = np.column_stack([np.ones(len(away)), away / max(np.abs(away).max(), 1e-12)])

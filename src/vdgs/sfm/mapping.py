@@ -26,12 +26,13 @@ def map_photographs(
     console: Console,
 ) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
     """The models, and whether the focal length was held and why; anew where the first show that lenses are fisheyes."""
-    found = fisheyes.read_found(workspace, key)
-    if not found and workspace.fisheyes_file.exists():  # found among other pairs, or by another focal length
+    is_open = plan.request.options.camera_model == "auto"  # whether the photographs may tell the lenses
+    found = fisheyes.read_found(workspace, key) if is_open else []
+    if not found and workspace.fisheyes_file.exists():  # found among other pairs, by another focal length, or not asked
         fisheyes.use_lenses(workspace, kinds, key, plan.threads, console)
         workspace.fisheyes_file.unlink()
     first = list[pycolmap.Reconstruction]()
-    if not found and plan.request.options.camera_model == "auto" and not _is_begun_anew(workspace, key):
+    if not found and is_open and not _is_begun_anew(workspace, key):
         first, found = _find_fisheyes(plan, workspace, kinds, key, count, console)
     if not found:
         return _mapped_as_told(plan, workspace, kinds, key, count, console, first)

@@ -11,8 +11,8 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from vdgs.captures.capture_dates import time_of
 from vdgs.geometry.geodesy import enu_from_geodetic
-from vdgs.sfm.flights import time_of
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 from vdgs.sfm.picture_colors import looks_visible
 

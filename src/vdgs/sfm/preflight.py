@@ -14,7 +14,8 @@ import numpy as np
 from shapely import MultiPoint
 
 from vdgs.captures.camera_height import height_range
-from vdgs.sfm.flights import LEAST_PHOTOGRAPHS, flights_of, time_of, time_order
+from vdgs.captures.capture_dates import time_of
+from vdgs.sfm.flights import LEAST_PHOTOGRAPHS, flights_of, time_order
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import ImageMetadata

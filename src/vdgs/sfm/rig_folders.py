@@ -9,10 +9,10 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from vdgs.captures.capture_dates import time_of
 from vdgs.captures.name_resolution import match_key
 from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.geometry.similarity import nearest_rotation
-from vdgs.sfm.flights import time_of
 from vdgs.sfm.focal_length import lens_numbers
 from vdgs.sfm.image_metadata import ImageMetadata
 

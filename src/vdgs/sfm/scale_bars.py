@@ -6,8 +6,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
-from vdgs.captures.known_distances import LocatedPoint, check_marked, read_known_distances, scale_of_distances
+from vdgs.captures.known_distances import (
+    LocatedPoint,
+    check_marked,
+    read_known_distances,
+    scale_of_distances,
+    spread_of_marks,
+)
 from vdgs.sfm.gcp_adjustment import triangulate
 from vdgs.sfm.gcp_list import GcpObservation, GroundControlPoint, find_photograph, find_sighting, photographs_by_name
 from vdgs.sfm.image_list import ImageList
@@ -17,6 +24,8 @@ from vdgs.system.lazy_pycolmap import pycolmap
 #: The distance from a camera to what it sees is the median of those to so many points at most: thousands of photographs
 #: times millions of points take half an hour, and the median is the same within a percent.
 MAX_POINTS = 10_000
+#: Steps by which the change of a pixel is measured, as a share of the depth.
+STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -65,16 +74,29 @@ def read_scale_bars(file: Path, collection: ImageList) -> ScaleBars:
 def known_scale(model: pycolmap.Reconstruction, bars: ScaleBars) -> tuple[float, float]:
     """The factor from the model's world to metres, and its standard deviation as a share.
 
-    Raises CaptureError for points that placed photographs do not show, marks that are wrong, and distances that
-    contradict each other.
+    Raises CaptureError for points that placed photographs do not show, marks that are wrong, distances that contradict
+    each other, and those that photographs do not tell.
     """
-    located = {}
+    located, images = {}, {image.name: image for image in model.images.values() if image.has_pose}
     for point in bars.points:
         seen = (*point.observations, *_ray_sightings(model, [ray for ray in bars.rays if ray.name == point.name]))
         found = triangulate(model, replace(point, observations=seen))
         if found is not None:
-            located[point.name] = LocatedPoint(found.position, found.error_px)
+            views = [images[each.image] for each in seen if each.image in images]
+            spread = spread_of_marks(np.array([_jacobian(model, view, found.position) for view in views]))
+            located[point.name] = LocatedPoint(found.position, found.error_px, len(views), spread)
     return scale_of_distances(bars.distances, located, _pixel(model), bars.source)
+
+
+def _jacobian(
+    model: pycolmap.Reconstruction, view: pycolmap.Image, place: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "2 3"]:
+    """How the pixel that shows a place changes with the place."""
+    pose = np.asarray(view.cam_from_world().matrix())
+    there = pose @ np.append(place, 1.0)
+    steps = STEP * there[2] * np.concatenate([np.eye(3), -np.eye(3)])
+    shown = np.asarray(model.cameras[view.camera_id].img_from_cam(there + steps))
+    return (shown[:3] - shown[3:]).T / (2 * STEP * there[2]) @ pose[:, :3]
 
 
 def _ray_sightings(model: pycolmap.Reconstruction, rays: list[RayMark]) -> list[GcpObservation]:

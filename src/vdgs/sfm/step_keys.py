@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from vdgs.errors import CaptureError
+from vdgs.sfm import fisheyes
+from vdgs.sfm.feature_extraction import group_by_camera
 from vdgs.sfm.image_metadata import RADIAL
 from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -34,7 +36,7 @@ def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, st
         *_other_cameras(plan),
     )  # fmt: skip
     matched = cache_key(found, options.num_neighbors, options.exhaustive_max)
-    asked = cache_key(matched, options.focal)
+    asked = cache_key(matched, options.focal, *_told_lenses(plan))
     mapped = cache_key(asked, should_fix_focal(plan.image_list.images, positions, options)[0])
     capture = cache_key(asked, options.max_output_size)
     points, bars = plan.gcps.points if plan.gcps else (), plan.scale_bars
@@ -48,6 +50,14 @@ def _other_cameras(plan: ReconstructionPlan) -> list[tuple[str, ...]]:
     """Photographs that are converted, or whose lens has another model or whose camera is one of a rig."""
     said = [(photo.name, photo.camera_model, photo.sensor, photo.kind) for photo in plan.image_list.images]
     return [each for each in said if each[1:] != (RADIAL, "", "")]
+
+
+def _told_lenses(plan: ReconstructionPlan) -> tuple[str, ...]:
+    """That a person says a model of lenses which the photographs may contradict otherwise (`fisheyes`); empty where
+    they would find the same by themselves, so that what is finished stays."""
+    if plan.request.options.camera_model == "auto":
+        return ()
+    return (RADIAL,) if fisheyes.may_be_found(group_by_camera(plan.image_list.images)) else ()
 
 
 def _masked_images(plan: ReconstructionPlan, digests: ContentDigests) -> list[tuple[Any, ...]]:
