@@ -217,6 +217,14 @@ def test_fisheyes_are_bentleys(tmp_path, flight, in_pixels):
     assert np.abs(ray_pixels(source.views[0].intrinsics, rays) - bent @ matrix.T - center).max() < 0.01
 
 
+def test_distortion_that_is_not_known_is_refused_by_its_name(tmp_path, flight):
+    xml = blocks_xml(flight, None).replace("<Distortion>", "<Distortion><K4>0.1</K4>")
+    with pytest.raises(CaptureError, match=r"distortion that is not known \(K4\)"):
+        read(tmp_path, xml, flight)
+    zero = read(tmp_path, xml.replace("<K4>0.1<", "<K4>0<"), flight)
+    assert zero.views[0].intrinsics.is_distorted
+
+
 def test_a_photogroup_that_cannot_be_used_is_named_and_the_others_are_used(tmp_path, flight):
     turned = "<Rotation><Omega>1</Omega><Phi>2</Phi><Kappa>3</Kappa></Rotation>"
     pose = f"<Pose>{turned}<Center><x>1</x><y>2</y><z>3</z></Center></Pose>"

@@ -20,6 +20,7 @@ MATRIX = [[50.0, 0, 32.0], [0, 51.0, 24.0], [0, 0, 1]]
 RADTAN, RADTAN_K3 = [-0.2, 0.05, 0.001, -0.002], [-0.2, 0.05, 0.001, -0.002, 0.03]
 OPENCV = ("OPENCV", (-0.2, 0.05, 0.001, -0.002))
 FULL = ("FULL_OPENCV", (-0.2, 0.05, 0.001, -0.002, 0.03, 0.0, 0.0, 0.0))
+ONE = ("OPENCV", (-0.2, 0.0, 0.0, 0.0))
 FISHEYE = ("OPENCV_FISHEYE", (-0.2, 0.05, 0.001, -0.002))
 PINHOLE: tuple[str, tuple[float, ...]] = ("PINHOLE", ())
 
@@ -54,6 +55,22 @@ def lens_of(common: dict, frame: dict | None = None) -> Intrinsics:
         ({"distortion_map": "", "undistorted": True, "is_distorted": False, "radius": 2.5}, PINHOLE),
         ({"distortion_score": 0.3, "distortion_applied": 1, "fisheye_fov": 190.0}, PINHOLE),
         ({"camera": {"camera_model": "iPhone 14 Pro"}}, PINHOLE),
+        ({"camera_model": "SIMPLE_RADIAL", "k": -0.2}, ONE),
+        ({"camera_model": "SIMPLE_RADIAL", "k": 0.0}, PINHOLE),
+        ({"camera_model": "RADIAL", "k1": 0, "k2": 0}, PINHOLE),
+        ({"camera_model": "OPENCV"}, PINHOLE),  # as converters write it of phones
+        ({"k": RADTAN}, OPENCV),
+        ({"k": [-0.2]}, ONE),
+        ({"K": [50.0, 51.0, 32.0, 24.0]}, PINHOLE),
+        ({"K": [[50.0, 0, 32.0], [0, 51.0, 24.0], [0, 0, 1]], "k": -0.2}, ONE),
+        ({"dist": [-0.2]}, ONE),
+        ({"coeffs": RADTAN, "kappa": 92.5}, OPENCV),
+        ({"k_1": -0.2, "k2 ": 0.05, "lens_p1": 0.001, "P-2": -0.002}, OPENCV),
+        ({"lens": {"model": "SIMPLE_RADIAL", "k": -0.2}}, ONE),
+        ({"camera_model": "OPENCV", "params": [50.0, 51.0, 32.0, 24.0, *RADTAN]}, OPENCV),
+        ({"camera_model": "OPENCV_FISHEYE", "colmap_params": [50.0, 51.0, 32.0, 24.0, *RADTAN]}, FISHEYE),
+        ({"intrinsics": [50.0, 51.0, 32.0, 24.0, *RADTAN]}, OPENCV),
+        ({"params": [1, 2, 3], "coefficients": list(range(27))}, PINHOLE),
         ({"lens_model": "Hasselblad L2D-20c", "lens": "24 mm", "dist": [1.0, 2.0], "camera": {"fov": 84}}, PINHOLE),
     ],
 )
@@ -61,6 +78,22 @@ def test_distortion_of_other_programs_is_read(says, model):
     expected = Intrinsics(model[0], (50.0, 51.0, 32.0, 24.0, *model[1]), 64, 48)
     assert lens_of(HEAD | says) == expected
     assert lens_of(HEAD, says) == expected  # of each frame
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        {"camera_model": "SIMPLE_RADIAL", "params": [50.0, 32.0, 24.0, -0.2]},
+        {"lens": {"model": "SIMPLE_RADIAL", "params": [50.0, 32.0, 24.0, -0.2]}},
+        {"camera_model": "RADIAL", "intrinsics": [50.0, 32.0, 24.0, -0.2, 0.0]},
+        {"params": [50.0, 50.0, 32.0, 24.0, -0.2, 0.0, 0.0, 0.0]},
+    ],
+)
+def test_parameters_in_the_order_of_colmap_are_a_whole_lens(says):
+    expected = Intrinsics("OPENCV", (50.0, 50.0, 32.0, 24.0, *ONE[1]), 64, 48)
+    size = {"w": 64, "h": 48}
+    assert lens_of(size | says) == lens_of(size, says) == expected
+    assert lens_of(HEAD | says).params == (50.0, 51.0, *expected.params[2:])  # known keys count more
 
 
 @pytest.mark.parametrize(
@@ -84,6 +117,19 @@ def test_distortion_of_other_programs_is_read(says, model):
         ({"radial_coeffs": [0.1, 0.1, 0.1, 0.1, 0.1, 0.1]}, "'radial_coeffs' cannot be read"),
         ({"distortion": {"k1": 0.1, "k6": 0.1}}, "k6 is not supported"),
         ({"fisheye": True}, "'fisheye' cannot be read"),
+        ({"camera_model": "SIMPLE_RADIAL"}, "SIMPLE_RADIAL bends, and no key is known"),
+        ({"lens": {"model": "RADIAL_FISHEYE"}}, "RADIAL_FISHEYE bends, and no key is known"),
+        ({"k": 800.0}, "'k' may be coefficients, or focal lengths"),
+        ({"K": [0.8, 0.8, 0.5, 0.5]}, "'K' may be coefficients, or focal lengths"),
+        ({"k": [0.1, 0.2, 0.3]}, "'k' cannot be read: 3 numbers"),
+        ({"camera_model": "SIMPLE_RADIAL", "params": [50.0, 32.0, 24.0, 0.1, 0.2]}, "5 parameters .* has 4"),
+        ({"colmap_params": [50.0, 32.0, 24.0, 0.1]}, "4 parameters of a lens, and no camera_model"),
+        ({"params": [50.0, 32.0, 24.0, 0.1]}, "4 parameters of a lens, and no camera_model"),
+        ({"intrinsics": [50.0, 51.0, 32.0, 24.0, 0.1, 0.2]}, "'intrinsics' (may hold lens distortion|is neither)"),
+        ({"k_5": 0.1}, "k5 is not supported"),
+        ({"p3": 0.1}, "p3 is not supported"),
+        ({"wide_k1": 0.1}, "'wide_k1' cannot be read"),
+        ({"intrinsics": {"model": "Inverse Brown Conrady", "coeffs": RADTAN}}, "Brown Conrady' is not supported"),
     ],
 )
 def test_distortion_that_cannot_be_read_is_refused_by_name(says, message):

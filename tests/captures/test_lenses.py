@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,11 @@ from vdgs.captures.formats.brown_lens import (
     quarter_turn_fisheye,
     unproject_pixels,
 )
-from vdgs.captures.formats.lens_projection import pixel_rays, ray_pixels
+from vdgs.captures.formats.lens_projection import fold_radius, pixel_rays, ray_pixels
 from vdgs.captures.formats.source_capture import BROWN, GENERAL, GENERAL_FISHEYE, Intrinsics
 from vdgs.captures.image_matching import scale_intrinsics
-from vdgs.captures.undistortion import sampling_map, undistorted_pinhole
+from vdgs.captures.pinholes import fold_notes, undistorted_pinhole
+from vdgs.captures.undistortion import sampling_map
 from vdgs.errors import CaptureError
 
 SIZE = (5280, 3956)
@@ -110,8 +112,68 @@ def test_where_a_lens_folds_over_there_is_no_ray():
     rays = unproject_pixels(folded, np.array([[500.0, 400.0], [5.0, 5.0]]))
     assert np.isfinite(rays[0]).all()
     assert np.isnan(rays[1]).all()
-    with pytest.raises(CaptureError, match="folds over"):
-        undistorted_pinhole(folded)
+
+
+#: Lenses that fold over within their photographs, each with the share of them that is to be left.
+FOLDED = [
+    (Intrinsics("OPENCV", (60.0, 60.0, 50.0, 37.5, -0.28, 0.03, 0.001, -0.002), 100, 75), 0.75),
+    (Intrinsics("FULL_OPENCV", (86.0, 86.0, 90.0, 56.0, -0.28, 0.1, 0.0, 0.0, -0.02, 0.0, 0.0, 0.0), 192, 108), 0.65),
+    (Intrinsics("SIMPLE_RADIAL", (60.0, 50.0, 37.5, -0.3), 100, 75), 0.6),
+    (Intrinsics("OPENCV_FISHEYE", (36.0, 36.0, 50.0, 37.5, -0.2, 0.0, 0.0, 0.0), 100, 75), 0.3),
+    (Intrinsics(BROWN, (60.0, 60.0, 50.0, 37.5, -0.28, 0.03, 0.001, -0.002, 0.0, 0.0, 0.1), 100, 75), 0.75),
+    (Intrinsics(GENERAL_FISHEYE, (36.0, 36.0, 50.0, 37.5, -0.2, *[0.0] * 13), 100, 75), 0.3),
+]
+
+
+@pytest.mark.parametrize(("lens", "least"), FOLDED)
+def test_a_lens_that_folds_over_within_its_photograph_shows_nothing_twice(lens, least):
+    """The picture is upright everywhere, of what is in the photograph, and a note says how much that is."""
+    grid = sampling_map(lens, undistorted_pinhole(lens)).astype(float)
+    across, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
+    area = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+    assert (area > 0).mean() > 0.999  # differences of neighbors, and not slopes
+    assert grid.min() > -1
+    assert (grid < (lens.width, lens.height)).all()
+    shown = area.sum() / (lens.width * lens.height)
+    assert shown > least
+    (note,) = fold_notes([lens, lens])
+    told = int(re.search(r"the (\d+)% in the middle", note)[1])
+    assert told == pytest.approx(100 * shown, abs=3)
+    rays = pixel_rays(lens, pixels_of(lens))  # where features lie, the fold's other side included
+    known = np.isfinite(rays).all(axis=1)
+    np.testing.assert_allclose(ray_pixels(lens, rays[known]), pixels_of(lens)[known], atol=1e-4)
+    assert shown - 0.02 < known.mean() < 1
+    assert np.hypot(*rays[known].T).max() <= fold_radius(lens)
+
+
+def test_what_lies_beyond_the_fold_of_a_lens_lies_outside_its_picture():
+    """So that masks leave it out, whatever the pinhole camera is."""
+    lens, wide = FOLDED[2][0], Intrinsics("PINHOLE", (20.0, 20.0, 50.0, 37.5), 100, 75)
+    rows, columns = np.mgrid[:75, :100] + 0.5
+    beyond = np.hypot(columns - 50, rows - 37.5) / 20 > fold_radius(lens)
+    grid = sampling_map(lens, wide)
+    assert fold_radius(lens) == pytest.approx(1 / np.sqrt(0.9), rel=1e-6)
+    assert grid[beyond].max() < -1e5
+    assert grid[~beyond].min() > -10
+
+
+def test_a_lens_that_folds_over_beyond_its_photograph_is_used_in_full():
+    for tail in ((-0.28, 0.045, 0.0, 0.0), (-0.1, 0.02, 0.001, -0.001)):
+        lens = Intrinsics("OPENCV", (70.0, 70.0, 50.0, 37.5, *tail), 100, 75)
+        corners = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 75.0], [0.0, 75.0]])
+        assert np.isfinite(pixel_rays(lens, corners)).all()
+        assert fold_notes([lens]) == []
+        edges = sampling_map(lens, undistorted_pinhole(lens))
+        assert min(edges[0, :, 1].min(), edges[:, 0, 0].min()) < 0.6
+
+
+def test_a_lens_that_folds_over_near_the_middle_is_refused():
+    for lens in (
+        Intrinsics("SIMPLE_RADIAL", (80.0, 50.0, 40.0, -4.0), 100, 80),
+        brown_intrinsics((80.0, 80.0), (50.0, 40.0), (100, 80), (-4.0,), skew=0.1),
+    ):
+        with pytest.raises(CaptureError, match=r"folds over 16°.*no more than \d+% of each photograph"):
+            undistorted_pinhole(lens)
 
 
 @pytest.mark.parametrize("center", [(502.5, 372.5), (490.0, 384.0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tracemalloc
@@ -16,6 +17,7 @@ from PIL import Image
 
 from support.captures import UP, TinyScene, data_folder, render_plane, tiny_scene, up, write_colmap, write_images
 from vdgs.captures import undistortion
+from vdgs.captures.formats.lens_projection import fold_radius
 from vdgs.captures.formats.source_capture import Intrinsics, SourceView
 from vdgs.captures.image_cache import load_image
 from vdgs.captures.image_checks import check_images
@@ -23,7 +25,8 @@ from vdgs.captures.image_files import decode_image, decode_mask
 from vdgs.captures.image_matching import fit_to_image, scale_intrinsics
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import input_folders
-from vdgs.captures.undistortion import ImageFile, sampling_map, undistorted_pinhole
+from vdgs.captures.pinholes import undistorted_pinhole
+from vdgs.captures.undistortion import ImageFile, sampling_map
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.pipeline.image_size import image_sizes
@@ -380,6 +383,17 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
     again = load_capture(tmp_path, up(undistort=True))
     assert len(again.views) == len(written) == 4
     assert all(file.stat().st_mtime_ns == time for file, time in written.items())
+
+
+def test_photographs_of_a_lens_that_folds_over_within_them_are_cut_and_a_warning_says_so(tmp_path):
+    write_colmap(tmp_path, tiny_scene(columns=2, rows=2, width=80, height=60), model="SIMPLE_RADIAL", extra=(-0.9,))
+    capture = load_capture(tmp_path, up(undistort=True))
+    (said,) = [warning for warning in capture.warnings if "folds over" in warning]
+    assert re.search(r"SIMPLE_RADIAL .* of 80x60 pixels: (\d+)% of each photograph is left out", said)
+    lens = Intrinsics("SIMPLE_RADIAL", (capture.views[0].camera.fx, 40.0, 30.0, -0.9), 80, 60)
+    for view in capture.views:
+        camera = view.camera
+        assert np.hypot(camera.cx / camera.fx, camera.cy / camera.fy) < 0.99 * fold_radius(lens)
 
 
 def test_the_map_of_a_lens_is_made_once_for_all_its_photographs(tmp_path, monkeypatch):

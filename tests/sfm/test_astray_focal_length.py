@@ -56,10 +56,11 @@ def test_a_fitted_focal_length_goes_astray_where_it_leaves_tags_that_agree(focal
 def test_a_lens_that_is_none_is_astray_whatever_the_size_of_its_focal_length():
     model = model_of()
     assert model.cameras[1].model_name == "SIMPLE_RADIAL"
-    model.cameras[1].params = [FOCAL, 512, 384, 3.0]
-    with pytest.raises(CaptureError, match="none that there is"):
-        fitted_intrinsics(model.cameras[1])
-    assert is_astray(model, FITTED, [GROUP])
+    for focal, k in ((FOCAL, 3.0), (0.45 * FOCAL, -0.9)):  # the latter folds over near the middle
+        model.cameras[1].params = [focal, 512, 384, k]
+        with pytest.raises(CaptureError, match="none that there is"):
+            fitted_intrinsics(model.cameras[1])
+        assert is_astray(model, FITTED, [GROUP])
 
 
 @pytest.mark.parametrize("images", [4, 20])

@@ -22,6 +22,7 @@ from vdgs.captures.image_suffixes import VIDEO_SUFFIXES
 from vdgs.captures.nested_captures import check_no_foreign_file
 from vdgs.captures.off_path import match_off_path
 from vdgs.captures.output_guard import check_not_among_files
+from vdgs.captures.pinholes import fold_notes
 from vdgs.captures.project_formats import is_project
 from vdgs.captures.splits import assign_splits, select_central_views
 from vdgs.captures.undistortion import ImageFile, undistort
@@ -162,6 +163,7 @@ def _undistorted(
     warnings.append(
         f"{len(bent)} photographs with lens distortion ({', '.join(models)}) were undistorted into {folder}."
     )
+    warnings += fold_notes(photo.file.intrinsics for photo in bent)
     return [MatchedView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vdgs.captures.formats.brown_lens import brown_pinhole
-from vdgs.captures.formats.lens_projection import colmap_camera, ray_pixels
-from vdgs.captures.formats.source_capture import OWN_LENSES, Intrinsics
+from vdgs.captures.formats.lens_projection import is_valid_ray, ray_pixels
+from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image, decode_mask, verify_image
 from vdgs.captures.name_resolution import jpeg_name
+from vdgs.captures.pinholes import undistorted_pinhole
 from vdgs.errors import CaptureError
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes
 
@@ -41,7 +41,7 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
     """Pinhole versions of the photographs and their masks.
 
     Files are written under `folder`, each image beside a small JSON that says from which files, of which
-    size and date, and with which camera it was made; what matches is reused. Photographs without
+    size and date, and from which camera to which it was made; what matches is reused. Photographs without
     distortion pass through. Raises `CaptureError` if the folder cannot be written or an image cannot be
     decoded.
     """
@@ -71,24 +71,6 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
         ) from error
 
 
-def undistorted_pinhole(intrinsics: Intrinsics) -> Intrinsics:
-    """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and center)."""
-    if intrinsics.model in OWN_LENSES:
-        return brown_pinhole(intrinsics)
-    from vdgs.system.lazy_pycolmap import pycolmap  # 60 MB of memory: only for lenses that need it
-
-    try:
-        camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), colmap_camera(intrinsics))
-    except Exception as error:  # pycolmap raises plain ValueError and RuntimeError kinds
-        raise CaptureError(
-            f"the camera {intrinsics.model} {intrinsics.params} cannot be undistorted ({error}). "
-            "Undistort with colmap image_undistorter and use its output folder."
-        ) from error
-    center = (camera.principal_point_x, camera.principal_point_y)
-    focal = (camera.focal_length_x, camera.focal_length_y)
-    return Intrinsics("PINHOLE", (*focal, *center), camera.width, camera.height)
-
-
 def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STRIP_PX) -> np.ndarray:
     """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32.
 
@@ -101,9 +83,10 @@ def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STR
     found = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     for first in range(0, pinhole.height, rows):
         y = (np.arange(first, min(first + rows, pinhole.height)) + 0.5 - cy) / fy
-        rays = np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1)
-        pixels = ray_pixels(distorted, rays.reshape(-1, 2))
-        pixels = np.where(np.isfinite(pixels), pixels, -1e6)  # behind a fisheye's rim: outside
+        rays = np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1).reshape(-1, 2)
+        pixels = ray_pixels(distorted, rays)
+        shown = np.isfinite(pixels) & is_valid_ray(distorted, rays)[:, None]
+        pixels = np.where(shown, pixels, -1e6)  # behind a fisheye's rim, or where a lens folds over: outside
         found[first : first + rows] = (pixels - 0.5).reshape(len(y), len(x), 2)
     return found
 
@@ -114,7 +97,9 @@ def _undistort_one(
     target = folder / jpeg_name(photo.name)
     mask_target, stamp_file = (target.with_name(target.name + suffix) for suffix in (".mask.png", ".json"))
     lens = photo.intrinsics
-    stamp: dict[str, object] = {"camera": [lens.model, *lens.params, lens.width, lens.height]}
+    stamp: dict[str, object] = {
+        kind: [each.model, *each.params, each.width, each.height] for kind, each in (("camera", lens), ("to", pinhole))
+    }
     for kind, file in (("image", photo.path), ("mask", photo.mask)):
         status = file.stat() if file else None
         stamp[kind] = status and [str(file), status.st_size, status.st_mtime_ns]

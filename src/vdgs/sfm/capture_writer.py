@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 
 from vdgs.captures.formats.colmap_writing import write_model_files
+from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.name_resolution import jpeg_name
-from vdgs.captures.undistortion import encode_jpeg, sampling_map, undistorted_pinhole
+from vdgs.captures.pinholes import folds_to_nothing, undistorted_pinhole
+from vdgs.captures.undistortion import encode_jpeg, sampling_map
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
@@ -214,8 +216,8 @@ def write_model(
     for image in placed_images(model):
         seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
         bent = np.array([image.points2D[k].xy for k in seen]).reshape(-1, 2)
-        rays = np.asarray(model.cameras[image.camera_id].cam_from_img(bent)).reshape(-1, 2)
-        shown = np.isfinite(rays).all(axis=1)  # a fisheye may look beside and behind itself
+        rays = pixel_rays(lens_of(model.cameras[image.camera_id]), bent)
+        shown = np.isfinite(rays).all(axis=1)  # a fisheye may look beside and behind itself, and a lens fold over
         seen, rays = [k for k, there in zip(seen, shown, strict=True) if there], rays[shown]
         camera_id = image.camera_id if pinhole_of is None else pinhole_of[image.name]
         fx, fy, cx, cy = pinholes[camera_id].params
@@ -257,7 +259,7 @@ def _is_of_rig(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
 def is_impossible(camera: pycolmap.Camera) -> bool:
     """Whether there is no such lens."""
     bogus = not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0)
-    return bogus or _perspective_deg(camera) > WIDEST_DEG
+    return bogus or _perspective_deg(camera) > WIDEST_DEG or folds_to_nothing(lens_of(camera))
 
 
 def _perspective_deg(camera: pycolmap.Camera) -> float:
@@ -281,4 +283,9 @@ def fitted_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
             f"the fitted lens of a camera ({camera.params_to_string()}) is none that there is: the photographs do not "
             "tell it. Hold the focal length: --focal fixed"
         )
+    return lens_of(camera)
+
+
+def lens_of(camera: pycolmap.Camera) -> Intrinsics:
+    """The lens of a camera, whatever it is."""
     return Intrinsics(camera.model_name, tuple(float(value) for value in camera.params), camera.width, camera.height)

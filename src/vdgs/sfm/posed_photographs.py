@@ -20,6 +20,7 @@ from vdgs.captures.georeference import Georef
 from vdgs.captures.image_matching import MatchedView, match_images
 from vdgs.captures.image_tags import kind_of, may_be_transparent
 from vdgs.captures.pillow_limits import pillow_without_limits
+from vdgs.captures.pinholes import fold_notes
 from vdgs.captures.reconstruction import read_digests
 from vdgs.captures.split_lists import TEST_LIST, VALIDATION_LIST
 from vdgs.captures.splits import held_out_by_capture
@@ -102,6 +103,7 @@ def read_posed_photographs(request: SfmRequest, options: CaptureOptions) -> Pose
     if transparent and source.source in READERS:
         what = "becomes white, as is usual for sets of Blender" if on_white else "is left out, as by a mask"
         warnings.append(f"{transparent} photographs are transparent: what is transparent {what}.")
+    warnings += fold_notes(view.file.intrinsics for view in views)
     return PosedPhotographs(
         source=source, views=tuple(views), pinholes=_pinholes([view.file.intrinsics for view in views]),
         request=request, digests=read_digests(request.output), warnings=(*source.warnings, *warnings),

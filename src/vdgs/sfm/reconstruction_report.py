@@ -10,6 +10,7 @@ import numpy as np
 from vdgs.captures.camera_height import height_range
 from vdgs.captures.capture_dates import first_and_last
 from vdgs.captures.formats.source_capture import format_list
+from vdgs.captures.pinholes import fold_notes
 from vdgs.captures.reconstruction import (
     OVER_GROUND,
     OVER_MEDIAN,
@@ -21,7 +22,7 @@ from vdgs.captures.reconstruction import (
 from vdgs.errors import CaptureError
 from vdgs.sfm.attitude_tilt import tilt_of_views
 from vdgs.sfm.camera_rigs import describe_rigs
-from vdgs.sfm.capture_writer import placed_images
+from vdgs.sfm.capture_writer import lens_of, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.fisheyes import MAX_FISHEYE_MM, equivalent_mm
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
@@ -103,6 +104,7 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
         names = [collection.images[int(positions.image_indices[row])].name for row in placed.position_rows]
         warnings += _lens_warnings(collection.images, dict(zip(names, up.tolist(), strict=True)), height)
     warnings += _survey_warnings(result.found.survey)
+    warnings += fold_notes(lens_of(model.cameras[number]) for number in sorted({image.camera_id for image in images}))
     if any(photo.sensor for photo in collection.images):
         warnings += describe_rigs(model, "m" if metric else "units of the model")
     advice = _advice(look, held[0], len(images), sum(photo.face != "up" for photo in collection.images))

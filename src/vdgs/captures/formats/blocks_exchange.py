@@ -37,6 +37,8 @@ _DIRECTIONS = {"Right": (1, 0), "Left": (-1, 0), "Down": (0, 1), "Up": (0, -1)}
 #: Where DJI Terra puts its files in a project.
 _TERRA_FOLDER = "AT"
 _WITHOUT_POINTS = "_withouttiepoints"
+#: Terms of the distortion of a lens that is no fisheye.
+_TERMS = ("K1", "K2", "K3", "P1", "P2")
 #: Measurements of tie points that are kept, of each photograph: more than are looked at afterwards.
 _MEASUREMENTS = 4000
 
@@ -238,9 +240,11 @@ class _Block:
             return check_intrinsics(lens, self._file, label)
         bends = group.find("Distortion")
         k1, k2, k3, p1, p2 = (
-            0.0 if bends is None else xml_number(bends, name, self._file, label, 0.0)
-            for name in ("K1", "K2", "K3", "P1", "P2")
+            0.0 if bends is None else xml_number(bends, name, self._file, label, 0.0) for name in _TERMS
         )
+        others = [each.tag for each in (() if bends is None else bends) if each.tag not in _TERMS]
+        if bends is not None and any(xml_number(bends, name, self._file, label, 0.0) for name in others):
+            raise CaptureError(f"{label} has distortion that is not known ({', '.join(others)}).")
         skew = xml_number(group, "Skew", self._file, label, 0.0)
         lens = brown_intrinsics((focal, focal * aspect), center, (width, height), (k1, k2, k3), (p2, p1), skew)
         return check_intrinsics(lens, self._file, label)

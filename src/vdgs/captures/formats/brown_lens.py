@@ -16,7 +16,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from vdgs.captures.formats.source_capture import BROWN, EQUISOLID, GENERAL, GENERAL_FISHEYE, Intrinsics
-from vdgs.errors import CaptureError
 
 #: Newton's steps, which settle in five for lenses that there are, and what is left of the ray at most.
 MAX_STEPS, TOLERANCE = 30, 1e-12
@@ -123,18 +122,18 @@ def _straight(lens: Intrinsics, pixels: np.ndarray, widest: float, *, clip: bool
     return np.where(good[:, None], rays, np.nan)
 
 
-def brown_pinhole(lens: Intrinsics) -> Intrinsics:
-    """The pinhole camera whose picture holds no blank pixels, by COLMAP's rule for its own models."""
+def brown_pinhole(lens: Intrinsics) -> Intrinsics | None:
+    """The pinhole camera whose picture holds no blank pixels, by COLMAP's rule for its own models; None where no pixel
+    of an edge of the photograph has a ray, or the principal point is not between the edges."""
     (fx, fy), (cx, cy), width, height = lens.focal, lens.principal_point, lens.width, lens.height
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     left, right = (_undistorted(lens, np.full(height, at), y)[:, 0] for at in (0.5, width - 0.5))
     top, bottom = (_undistorted(lens, x, np.full(width, at))[:, 1] for at in (0.5, height - 0.5))
-    gaps = cx - left.max(), right.min() - cx, cy - top.max(), bottom.min() - cy
-    if not all(gap > 0 for gap in gaps):  # NaN included
-        raise CaptureError(
-            f"the lens {lens.model} {lens.params} folds over within its {width}x{height} pixels: no lens does. "
-            "Calibrate it again, or undistort the photographs in the program that calibrated it and export them."
-        )
+    if any(np.isnan(edge).all() for edge in (left, right, top, bottom)):
+        return None
+    gaps = cx - np.nanmax(left), np.nanmin(right) - cx, cy - np.nanmax(top), np.nanmin(bottom) - cy
+    if not all(gap > 0 for gap in gaps):
+        return None
     across = max(cx / gaps[0], (width - 0.5 - cx) / gaps[1])
     down = max(cy / gaps[2], (height - 0.5 - cy) / gaps[3])
     new_width = int(min(max(1 / across, MIN_SCALE), MAX_SCALE) * width)

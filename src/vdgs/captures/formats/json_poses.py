@@ -17,8 +17,10 @@ from vdgs.captures.formats.lens_keys import (
     LENS,
     OTHER_PARAMETERS,
     RATIONAL,
+    check_has_coefficients,
     check_own_matrix,
     model_of_distortion,
+    named_model,
     with_known_keys,
     with_nested_model,
 )
@@ -162,9 +164,11 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     they were shrunk. Raises `CaptureError` for missing focal lengths and for lenses that are not understood.
     """
     model = _model(with_nested_model(common) | with_nested_model(frame), file)
-    own, shared = (with_known_keys(each, model in _FISHEYE, file) for each in (frame, common))
+    named = named_model(frame) or named_model(common)
+    own, shared = (with_known_keys(each, model in _FISHEYE, file, named) for each in (frame, common))
     replaced = FOCAL if not FOCAL.isdisjoint(own) else frozenset()  # a frame's angle says more than a common fl_x
     values = {**{key: value for key, value in shared.items() if key not in replaced}, **own}
+    check_has_coefficients(named, values, file)
 
     def get(key: str, default: float | None = None) -> float | None:
         value = parse_number(values, key, file)

@@ -29,19 +29,22 @@ _POLYNOMIAL = {
     "plumb_bob", "radtan", "radtan8", "radial_tangential", "brown", "brown_conrady", "rational_polynomial", "opencv",
     "full_opencv", "pinhole", "simple_pinhole", "perspective", "simple_radial", "radial", "brown5", "opencv5",
 }  # fmt: skip
-_FISHEYE = {"equidistant", "equi", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "kb4"}
+_FISHEYE = {
+    "equidistant", "equi", "fisheye", "opencv_fisheye", "kannala_brandt", "kannala_brandt4", "kb4", "simple_fisheye",
+    "simple_radial_fisheye", "radial_fisheye",
+}  # fmt: skip
 _POLYNOMIAL_IF_ZERO = {"inverse_brown_conrady", "modified_brown_conrady"}
 _NO_MODEL = {"", "none", "no", "false", "null", "undistorted", "rectified", "ideal", "linear"}
 #: Keys of such names; the model of a lens may be that of a shop.
 _MODEL_KEYS, _LOOSE_MODEL_KEYS = ("distortion_model", "distortion_type", "distortion"), ("lens_model", "model")
 #: Of which kind keys are, without case, underscores, spaces and hyphens: coefficients in OpenCV's order, matrices of
 #: focal lengths and principal point (or these four), objects that hold the keys of a lens, ...
-_Kind = Literal["list", "radial", "tangential", "matrix", "object", "same", "size", "term", "bends"]
+_Kind = Literal["list", "radial", "tangential", "matrix", "params", "object", "same", "size", "term", "bends"]
 _KINDS: dict[_Kind, set[str]] = {
     "list": {
         "distortion", "distortions", "distortioncoefficients", "distortioncoeffs", "distortioncoefs", "distcoeffs",
         "distcoefs", "distcoefficients", "distortionparameters", "distortionvector", "lensdistortion", "dist",
-        "distparams",
+        "distparams", "coeffs", "coefs", "coefficients", "cameracoeffs", "lenscoeffs", "kappa", "kappas",
     },
     "radial": {"radial", "radialdistortion", "radialcoeffs", "radialcoefficients"},
     "tangential": {"tangential", "tangentialdistortion", "tangentialcoeffs", "tangentialcoefficients"},
@@ -49,15 +52,39 @@ _KINDS: dict[_Kind, set[str]] = {
         "k", "intrinsics", "intrinsic", "cameramatrix", "cameraintrinsics", "intrinsicmatrix", "intrinsicsmatrix",
         "intrinsicparameters", "kmatrix",
     },
-    "object": {"camera", "camerainfo", "calibration", "lens", "lensparameters", "cameraparameters", "cameraparams"},
+    "params": {
+        "params", "colmapparams", "modelparams", "cameramodelparams", "cameraparams", "cameraparameters", "lensparams",
+        "lensparameters",
+    },
+    "object": {"camera", "camerainfo", "calibration", "lens"},
     "same": {"fx", "fy", "focalx", "focaly", "flx", "fly", "cx", "cy", "ppx", "ppy"},
     "size": {"w", "h", "width", "height", "imagewidth", "imageheight"},
 }  # fmt: skip
 _SAME = {"f": "fl_", "c": "c", "p": "c"}
+#: The parameters of COLMAP's models in its order, by nerfstudio's keys (f: both focal lengths); COLMAP's one k is k1.
+_COLMAP: dict[str, tuple[str, ...]] = {
+    name: tuple(keys.split())
+    for name, keys in {
+        "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1",
+        "RADIAL": "f cx cy k1 k2", "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2", "SIMPLE_FISHEYE": "f cx cy",
+        "FISHEYE": "fl_x fl_y cx cy", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1", "RADIAL_FISHEYE": "f cx cy k1 k2",
+        "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
+    }.items()
+}  # fmt: skip
+#: Of these, lenses that bend: programs write OPENCV of pinholes too, and the others have no coefficients.
+_BENT = {"SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+#: Keys that are said of other things too: distances to the scene, angles of a pose, numbers of any function.
+_DISTANCES, _ANGLES, _ANY_COEFFICIENTS, _MOST_COEFFICIENTS = "dist", "kappa", {"coeffs", "coefs", "coefficients"}, 14
+#: Numbers from this on are pixels, and below coefficients (choice): lenses have focal lengths of more pixels.
+_LEAST_PX = 10.0
 #: instant-ngp's angles of view, in degrees, which count more than focal lengths there.
 _DEGREES = {"x_fov": "camera_angle_x", "y_fov": "camera_angle_y"}
 #: Names of distortion that are not known, and names of what else may be a part of a lens.
-_BENDS = re.compile(r"(?<!un)distort|dist_?coef|radial|tangential|thin_?prism|fisheye|^xi$|omnidir", re.IGNORECASE)
+_BENDS = re.compile(
+    r"(?<!un)distort|dist_?coef|radial|tangential|thin_?prism|fisheye|^xi$|omnidir|_k[1-6]$", re.IGNORECASE
+)
+#: What stands before the name of a coefficient (`lens_k1`).
+_PREFIX = re.compile(r"^(lens|camera|cam|opencv|radial|tangential|distortion|dist|coeff?s?)(?=[kp]\d$)")
 #: What else is said of distortion, or of a lens that bends: no coefficients.
 _ABOUT = re.compile(r"score|error|rms|appl|enabled|correct|fov|field_?of_?view|version|count|num_", re.IGNORECASE)
 _OF_A_LENS = re.compile(
@@ -67,8 +94,8 @@ _OF_A_LENS = re.compile(
 #: Known keys, which are looked at elsewhere.
 _KNOWN = {*LENS, "distortion_params", "is_fisheye", "camera_model", "frames", "transform_matrix", *_MODEL_KEYS[:2]}
 #: Keys that nerfstudio's lens has not, which are looked at in `json_poses` as the others are.
-OTHER_PARAMETERS = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "rolling_shutter")
-_NESTED = (*LENS, *OTHER_PARAMETERS)
+OTHER_PARAMETERS = ("k5", "k6", "p3", "p4", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "rolling_shutter")
+_NESTED, _TERMS = (*LENS, *OTHER_PARAMETERS), {*LENS, "k5", "k6", "p3", "p4"}
 #: Numbers that differ by so much (share) are one, written with fewer digits (choice).
 _ROUNDED = 1e-4
 _REMEDY = "Write k1, k2, p1, p2 (and k3) of OpenCV's lens, or undistort the images first."
@@ -100,14 +127,32 @@ def model_of_distortion(values: Mapping[str, Any], file: Path) -> Literal["OPENC
                 return "OPENCV_FISHEYE"
             if name in _POLYNOMIAL or (name in _POLYNOMIAL_IF_ZERO and not any(map(_bends, objects))):
                 return "OPENCV"
-            if key in _MODEL_KEYS and name not in _NO_MODEL:
+            if (key in _MODEL_KEYS and name not in _NO_MODEL) or name in _POLYNOMIAL_IF_ZERO:
                 raise CaptureError(f"{file}: the lens of {key} {said!r} is not supported; undistort the images first.")
     return None
 
 
-def with_known_keys(values: Mapping[str, Any], fisheye: bool, file: Path) -> JsonObject:
+def named_model(values: Mapping[str, Any]) -> str:
+    """The camera model of COLMAP's, in capitals, that a frame or the file names; empty where none is."""
+    said = [values.get("camera_model")]
+    said += [inner.get(key) for inner in _objects(values) for key in ("camera_model", *_LOOSE_MODEL_KEYS)]
+    return next((name for each in said if (name := str(each or "").strip().upper()) in _COLMAP), "")
+
+
+def check_has_coefficients(model: str, values: Mapping[str, Any], file: Path) -> None:
+    """Raise `CaptureError` where the named model is that of a lens that bends, and no coefficient was read, not even
+    zero."""
+    if model in _BENT and all(values.get(key) is None for key in LENS):
+        raise CaptureError(
+            f"{file}: the camera model {model} bends, and no key is known to hold its coefficients. {_REMEDY} Write "
+            "camera_model PINHOLE where they are undistorted."
+        )
+
+
+def with_known_keys(values: Mapping[str, Any], fisheye: bool, file: Path, model: str = "") -> JsonObject:
     """What a frame, or the file for all frames, says of its lens, by nerfstudio's keys and `RATIONAL`; other keys as
-    they are. Lists of coefficients are in the order of OpenCV's fisheye, or else of its polynomial.
+    they are. Lists of coefficients are in the order of OpenCV's fisheye, or else of its polynomial, and parameters of a
+    `model` of COLMAP's that is named in its order.
 
     Raises `CaptureError` naming the key of a distortion that cannot be read, or that contradicts another.
     """
@@ -120,12 +165,14 @@ def with_known_keys(values: Mapping[str, Any], fisheye: bool, file: Path) -> Jso
     has_focal = not FOCAL.isdisjoint(found)
     for inner in (values, *_objects(values)):
         kinds = {key: kind for key, value in inner.items() if value is not None and (kind := _kind(key)) is not None}
-        focals = [inner[key] for key, kind in kinds.items() if kind == "matrix" or _plain(key) in ("fx", "focalx")]
+        focals = [
+            inner[key] for key, kind in kinds.items() if kind in ("matrix", "params") or _plain(key) in ("fx", "focalx")
+        ]
         # Beside a known focal length the others may be of the photograph before it was shrunk, and so its size.
         has_size = bool(focals) and (not has_focal or any(_starts_with(each, found.get("fl_x")) for each in focals))
         for key, kind in kinds.items():
             if (kind != "size" or has_size) and not (has_focal and kind == "same" and "f" in _plain(key)):
-                _read_key(found, key, kind, inner[key], fisheye, file)
+                _read_key(found, key, kind, inner[key], fisheye, model, file)
         for key in () if inner is values else [each for each in _NESTED if each in inner]:
             _add_terms(found, {key: inner[key]}, key, file)
         if all(any(_numbers(inner.get(key)) or ()) for key in ("alpha", "beta")):
@@ -144,7 +191,7 @@ def check_own_matrix(frame: Mapping[str, Any], own: Mapping[str, Any], size: tup
     """Raise `CaptureError` for a matrix of one frame (`own`: its known keys) that is of another size than the file says
     of all frames."""
     key = next((key for key in frame if _kind(key) == "matrix"), None)
-    if key is None or "w" in own or not FOCAL.isdisjoint(frame):
+    if key is None or "w" in own or "fl_x" not in own or not FOCAL.isdisjoint(frame):
         return
     (low, high), center = CENTERED, [own.get("cx"), own.get("cy")]
     if not all((c := _numbers(each)) and low < c[0] / side < high for each, side in zip(center, size, strict=True)):
@@ -169,12 +216,18 @@ def _may_say_more(key: str, value: object) -> bool:
     return not known and _is_of_a_lens(key) and any(_numbers(value, deep=True) or ())
 
 
-def _read_key(found: JsonObject, key: str, kind: _Kind, value: Any, fisheye: bool, file: Path) -> None:
+def _read_key(
+    found: JsonObject, key: str, kind: _Kind, value: Any, fisheye: bool, model: str, file: Path
+) -> None:  # fmt: skip
     """Add what one key of another program says of the lens to what is `found`."""
     numbers = _numbers(value)
     listed = numbers if isinstance(value, list | dict) else None
-    if key.lower() == "dist" and numbers is not None and len(numbers) < 4:
-        pass  # any distances
+    if _is_of_something_else(key, numbers, listed is not None):
+        pass
+    elif kind == "params" or (kind == "matrix" and listed is not None and _are_parameters(listed, model, fisheye)):
+        _add_params(found, key, listed or [], model, fisheye, file)
+    elif _plain(key) == "k" and numbers is not None and _are_coefficients(key, numbers, file):
+        _add_terms(found, _terms(key, numbers, fisheye, file), key, file)
     elif kind == "list" and listed is not None:
         _add_terms(found, _terms(key, listed, fisheye, file), key, file)
     elif kind == "list" and isinstance(value, dict | str):
@@ -194,7 +247,70 @@ def _read_key(found: JsonObject, key: str, kind: _Kind, value: Any, fisheye: boo
     elif kind == "size" and numbers is not None and all(each >= 1 for each in numbers):
         found.setdefault(_plain(key).removeprefix("image")[0], value)
     elif kind == "term":
-        _add_terms(found, {key.lower(): value}, key, file)
+        _add_terms(found, {_term(key): value}, key, file)
+
+
+def _is_of_something_else(key: str, numbers: list[float] | None, is_list: bool) -> bool:
+    """Whether a key that may be of a lens says something else: near and far distances, the angle kappa of a pose, how
+    many coefficients there are, or more of them than a lens has."""
+    name, numbers = _plain(key), numbers or []
+    if name == _DISTANCES:
+        small = is_list and 0 < max(numbers, default=0.0) < 1
+        return len(numbers) < 4 and all(each >= 0 for each in numbers) and not small
+    is_any = name in _ANY_COEFFICIENTS and len(numbers) > _MOST_COEFFICIENTS
+    return is_any or (not is_list and name in (_ANGLES, *_ANY_COEFFICIENTS))
+
+
+def _are_coefficients(key: str, numbers: list[float], file: Path) -> bool:
+    """Whether numbers under k, or K, are coefficients: not a matrix row by row, nor fx, fy, cx, cy. Raises
+    `CaptureError` where they may be either."""
+    if len(numbers) in _PLACES and len(numbers) != 4:
+        return False
+    if len(numbers) == 4 and all(each >= _LEAST_PX for each in numbers[:2]):
+        return False
+    (low, high), shares = CENTERED, numbers[2:]
+    if any(abs(each) >= _LEAST_PX for each in numbers) or (shares and all(low < each < high for each in shares)):
+        raise CaptureError(
+            f"{file}: {key!r} may be coefficients, or focal lengths and a principal point. Write fl_x, fl_y, cx, cy in "
+            "pixels, and k1, k2, p1, p2."
+        )
+    return True
+
+
+def _are_parameters(numbers: list[float], model: str, fisheye: bool) -> bool:
+    """Whether numbers under the name of a matrix are the parameters of a camera model: as many as the named one has, or
+    as OpenCV's have."""
+    if len(numbers) == 4:  # else fx, fy, cx, cy
+        return model in _BENT and abs(numbers[3]) < 1
+    return len(numbers) == len(_parameters(model, fisheye)) and numbers[0] >= _LEAST_PX
+
+
+def _parameters(model: str, fisheye: bool) -> tuple[str, ...]:
+    return _COLMAP[model or ("OPENCV_FISHEYE" if fisheye else "OPENCV")]
+
+
+def _add_params(
+    found: JsonObject, key: str, numbers: list[float], model: str, fisheye: bool, file: Path
+) -> None:  # fmt: skip
+    """Focal lengths, principal point and coefficients of a list in COLMAP's order; known keys beside it count more.
+    Raises `CaptureError` for a list of a lens that is not as long as the model's."""
+    names, focal = _parameters(model, fisheye), found.get("fl_x")
+    if not any(numbers):
+        return
+    is_of_a_lens = numbers[0] >= _LEAST_PX if focal is None else _starts_with(numbers, focal)
+    if _plain(key) == "params" and not model and not is_of_a_lens:
+        return
+    if len(numbers) != len(names):
+        order = f"{model} has {len(names)}" if model else "no camera_model says which"
+        raise CaptureError(f"{file}: {key!r} holds {len(numbers)} parameters of a lens, and {order}. {_REMEDY}")
+    values = dict(zip(names, numbers, strict=True))
+    if FOCAL.isdisjoint(found):
+        found.update(fl_x=values.get("f", values.get("fl_x")), fl_y=values.get("f", values.get("fl_y")))
+        found |= {name: found.get(name, values[name]) for name in ("cx", "cy")}
+    elif _is_of_size(found, (values["cx"], values["cy"])):
+        found |= {name: found.get(name, values[name]) for name in ("cx", "cy")}
+    terms: JsonObject = {name: values[name] for name in LENS if name in values}
+    _add_terms(found, terms and dict.fromkeys(LENS, 0.0) | terms, key, file)
 
 
 def _terms(key: str, numbers: list[float], fisheye: bool, file: Path) -> JsonObject:
@@ -252,6 +368,8 @@ def _add_matrix(found: JsonObject, key: str, numbers: list[float], file: Path) -
         numbers = [numbers[3 * row + column] for column in range(3) for row in range(3)]
     rest = {place: value for place, value in enumerate(numbers) if places is not None and place not in places}
     if places is None or any(value != float(place in _ONES[len(numbers)]) for place, value in rest.items()):
+        if 4 < len(numbers) < 9 and _starts_with(numbers, found.get("fl_x")) and found.keys().isdisjoint(LENS):
+            raise CaptureError(f"{file}: {key!r} may hold lens distortion, which cannot be read. {_REMEDY}")
         if has_focal or len(numbers) in (12, 16):
             return
         raise CaptureError(
@@ -283,7 +401,8 @@ def _bends(values: Mapping[str, Any]) -> bool:
 def _objects(values: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """The objects in an object that hold keys of its lens, and those in them."""
     for key, value in values.items():
-        if isinstance(value, dict) and _kind(key) in ("list", "matrix", "object") and _numbers(value) is None:
+        kinds = ("list", "matrix", "object", "params")
+        if isinstance(value, dict) and _kind(key) in kinds and _numbers(value) is None:
             yield value
             yield from _objects(value)
 
@@ -295,7 +414,7 @@ def _kind(key: str) -> _Kind | None:
         return None
     if key == "D":
         return "list"
-    if key.lower() in LENS:  # in capitals
+    if _term(key) in _TERMS:  # in capitals, with blanks, or with what it is of before it
         return "term"
     kind = next((kind for kind, names in _KINDS.items() if _plain(key) in names), None)
     return kind or ("bends" if _BENDS.search(key) and not _ABOUT.search(key) else None)
@@ -304,6 +423,10 @@ def _kind(key: str) -> _Kind | None:
 @lru_cache(maxsize=1024)
 def _is_of_a_lens(key: str) -> bool:
     return _OF_A_LENS.search(key) is not None
+
+
+def _term(key: str) -> str:
+    return _PREFIX.sub("", _plain(key))
 
 
 @lru_cache(maxsize=1024)
