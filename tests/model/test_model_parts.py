@@ -12,7 +12,7 @@ from support.hand_made_models import camera_above, model_at, quadrant_of, quadra
 from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
 from vdgs.evaluation.splat_artifacts import needle_share
-from vdgs.model.anchor_model import AnchorModel, DecoderSpan, ModelMetadata
+from vdgs.model.anchor_model import AnchorModel, DecoderSpan, ModelMetadata, has_envmap
 from vdgs.model.anchors import Anchors
 from vdgs.model.renderer import decode_view, render, render_scalar_map, without_aliasing
 from vdgs.partition.merging import merge_blocks
@@ -149,3 +149,14 @@ def test_the_coarse_decoder_stands_in_with_its_anchors():
     assert merged.decoder_spans[2].decoder is coarse.decoder
     owner = quadrant_of(coarse.anchors.positions[:, :2].numpy())
     assert merged.decoder_spans[2].count == int((owner == 2).sum())
+
+
+def test_a_file_says_whether_a_sky_is_drawn_behind(tmp_path):
+    plain, file = model_at(scattered(10)), tmp_path / "model.safetensors"
+    before_sky = replace(plain, decoder=replace(plain.decoder, envmap=torch.rand(4, 8, 3)))
+    for model, known in ((plain, False), (before_sky, True)):
+        model.save(file)
+        assert has_envmap(file) == known
+    file.write_bytes(file.read_bytes()[:40])
+    assert not has_envmap(file)
+    assert not has_envmap(tmp_path / "none")

@@ -26,7 +26,7 @@ from vdgs.model.decoder import Decoder
 from vdgs.model.local_exposure import LocalExposure
 from vdgs.model.model_metadata import ANCHOR_MODEL_FORMAT, MULTI_DECODER_FORMAT, NO_METADATA, ModelMetadata
 from vdgs.system.atomic_files import write_atomic
-from vdgs.system.tensors import REBUILD_HINT, read_tensors, tensors_crc32, write_tensors
+from vdgs.system.tensors import REBUILD_HINT, map_tensors, read_tensors, tensors_crc32, write_tensors
 
 #: The name of `AnchorModel.local_exposure` in a file.
 LOCAL_EXPOSURE = "local_exposure"
@@ -186,6 +186,14 @@ class AnchorModel:
     def _decoders(self) -> list[tuple[str, Decoder]]:
         """Every decoder with the prefix of its tensors in a file."""
         return [("decoder.", self.decoder), *((f"part.{i}.", s.decoder) for i, s in enumerate(self.decoder_spans))]
+
+
+def has_envmap(path: Path) -> bool:
+    """Whether the model in a file has an environment map, by its header; False for a file that cannot be read."""
+    try:
+        return "decoder.envmap" in map_tensors(path)[0]
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError):
+        return False
 
 
 def _pixel_size(value: float) -> float:

@@ -17,7 +17,7 @@ from vdgs.distributed.node_check import NodeRequirements, image_and_mask_files
 from vdgs.distributed.sharded_job import ExecutionOptions, ShardedJob, ShardNeeds
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.runs.model_integrity import map_verified
+from vdgs.model.anchor_model import has_envmap
 from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.open_run import load_run_blocks
 from vdgs.runs.run_context import RunContext
@@ -62,9 +62,10 @@ def train_blocks(
             worker="block", request=options, folder=run.path / "blocks", kind=BLOCK_LABELS,
             spans=tuple(range(index, index + 1) for index in range(len(blocks))),
         )  # fmt: skip
-        has_sky = map_verified(run.coarse, run.keys().coarse).envmap is not None
         needs = ShardNeeds(
-            _block_bytes(run, cameras, has_sky), lambda: NodeRequirements(run.path, files), decoded_image_bytes(cameras)
+            _block_bytes(run, cameras, has_envmap(run.coarse.model)),
+            lambda: NodeRequirements(run.path, files),
+            decoded_image_bytes(cameras),
         )
 
         def on_ready() -> None:
