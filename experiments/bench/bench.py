@@ -310,7 +310,7 @@ def _job(run: PlannedRun, plan: BenchPlan, capture: Path, key: str, settings: Be
         (settings.output / run.folder).resolve(),
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(), key,
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.visibility_bins, threads,
-        threads if settings.jobs == 1 else 1, settings.overwrite,
+        settings.overwrite,
         run.renders and run.renders.resolve(), settings.device,
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.bench.plan import BenchPlan
-from experiments.bench.results import BenchResult
+from experiments.bench.results import BenchResult, without_old_seconds
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json
 
@@ -42,13 +42,14 @@ def read_cached_results(files: Iterable[Path]) -> dict[str, BenchResult]:
 
 def _result(plain: Mapping[str, Any]) -> BenchResult:
     """A finished run, or renders of another program that were measured, whose costs nobody knows."""
+    plain = {"clock": 1, **plain}  # what is older says no clock
     result = BenchResult(**{each.name: plain[each.name] for each in fields(BenchResult)})
     if not result.key or not isinstance(result.figures["psnr"], float | None):
         raise ValueError("a run without key or figures")
     # Without them its seconds would stand beside others of another meaning.
     if "seconds" in result.figures and "preparation_seconds" not in result.figures:
         raise ValueError("a run whose seconds are those of its steps alone")
-    return replace(result, groups=tuple(result.groups), frusta=tuple(result.frusta))
+    return without_old_seconds(replace(result, groups=tuple(result.groups), frusta=tuple(result.frusta)))
 
 
 def drop_cached_runs(plan: BenchPlan, keys: Mapping[str, str], cached: Mapping[str, BenchResult]) -> BenchPlan:
@@ -82,4 +83,4 @@ def _grouped_alike(result: BenchResult, reference: BenchResult | None) -> bool:
 def _ungrouped(result: BenchResult) -> BenchResult:
     figures = {name: value for name, value in result.figures.items() if "@" not in name}
     reason = "Its groups by visibility are of other pixels than those of the runs here: it has none in this table."
-    return replace(result, figures=figures, groups=(), frusta=(), reason=reason)
+    return replace(result, figures=figures, groups=(), frusta=(), reason=f"{result.reason} {reason}".strip())

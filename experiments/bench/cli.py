@@ -61,9 +61,9 @@ class BenchArguments:
     max_anchors: Annotated[int, Range(0, MAX_COUNT)] = 0
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
     jobs: Annotated[int, Range(1, 1024)] = 1
-    """Runs at once; cores are shared among them."""
+    """Runs at once; cores are shared among them. The blocks of a run are trained one after another."""
     device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. On a card the blocks of a run are trained one after another."""
+    """Where to compute: auto, cpu, cuda or cuda:0."""
     overwrite: bool = False
     """Let other settings discard what was trained with the old ones."""
     lpips_weights: Path | None = None

@@ -10,8 +10,11 @@ from typing import Any
 from vdgs.config.method import DensifyConfig, MethodConfig, TrainConfig, scaled_growth_start
 from vdgs.config.presets import PRESETS, PresetName
 
-#: In the run folder: state, key, provenance, seconds of each stage.
+#: In the run folder: state, key, provenance, seconds of each stage, and by which clock.
 RECORD_FILE = "bench.json"
+#: What seconds mean. 2, since 2026-11-29: blocks train one after another, each on all threads, and pictures for people
+#: are left out. 1: blocks trained side by side, each on some of the threads, and the pictures of the cut counted.
+CLOCK = 2
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
 COARSE_STAGES = ("coarse", "evaluate")
 BLOCK_STAGES = ("coarse", "partition", "blocks", "merge", "evaluate")

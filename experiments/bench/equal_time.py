@@ -30,7 +30,7 @@ def step_factors(plan: BenchPlan, results: Sequence[BenchResult]) -> tuple[tuple
         if ours is None:
             raise VdgsError(
                 f"{scene.name}: --equal time takes the time of `{plan.table.ours}` for all, which has none here. "
-                f"Name it among --methods, and see why it failed."
+                "Name it among --methods, and see in table.md why there is none."
             )
         for name, taken in whole.items():
             before = fixed.get(name, 0.0)

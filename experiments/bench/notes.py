@@ -64,8 +64,9 @@ def _fairness(plan: BenchPlan) -> str:
         "gets fewer iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "all that leads from photographs to the model, measuring aside: starts and their stereo, V, the cut, the "
-        "assignment, the steps of all blocks as if one after the other, merging. Before 2026-11-28 it was the steps "
-        "alone. It depends on how many runs went at once (--jobs).",
+        "assignment, the steps of all blocks, one after another and each on all threads, merging; pictures for people "
+        "are left out. (Before 2026-11-28 it was the steps alone; before 2026-11-29 blocks trained side by side, and "
+        "pictures of the cut counted.) It depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
     if any(run.config.block.crop == "fixed-pixels" for run in plan.runs if has_block_folders(run.stages)):

@@ -11,7 +11,7 @@ from experiments.baselines.evaluation import EVALUATION_STATUS
 from experiments.baselines.gaussian_blocks.cut import GaussianCut
 from experiments.baselines.gaussian_blocks.training import block_statuses
 from experiments.bench.baseline_stages import baseline_folder
-from experiments.bench.definitions import RECORD_FILE, has_block_folders, has_gaussian_blocks
+from experiments.bench.definitions import CLOCK, RECORD_FILE, has_block_folders, has_gaussian_blocks
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, final_evaluation_folder
 from experiments.bench.plan import BenchPlan, PlannedRun
 from vdgs.distributed.executor import TaskResult
@@ -36,6 +36,8 @@ COSTS_FILE = "costs.json"
 BLOCK_COSTS = (
     "blocks", "block_seconds", "longest_block_seconds", "block_memory_bytes", "cameras_per_block", "coarse_seconds"
 )  # fmt: skip
+#: Of methods in blocks, seconds that another clock tells otherwise.
+CLOCKED_KEYS = ("seconds", "preparation_seconds", "block_seconds", "longest_block_seconds")
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ class BenchResult:
     key: str = ""
     #: When, on what and with which version it was trained (`provenance.py`).
     provenance: str = ""
+    #: What its seconds mean (`definitions.CLOCK`).
+    clock: int = CLOCK
 
 
 def collect_results(
@@ -109,10 +113,21 @@ def _read(output: Path, planned: PlannedRun, result: BenchResult) -> BenchResult
     by_frusta, _ = _groups(run.path / FRUSTA_FILE, "@frusta", figures)
     figures["unseen_share"] = measured.get("unseen_share")
     source = measured["visibility_source"] if bounds else ""
-    provenance = record.get("provenance", "")
-    return replace(
-        result, figures=figures, groups=bounds, visibility_source=source, frusta=by_frusta, provenance=provenance
-    )
+    provenance, clock = record.get("provenance", ""), record.get("clock", 1)
+    return without_old_seconds(replace(
+        result, figures=figures, groups=bounds, visibility_source=source, frusta=by_frusta, provenance=provenance,
+        clock=clock,
+    ))  # fmt: skip
+
+
+def without_old_seconds(result: BenchResult) -> BenchResult:
+    """The result without seconds by an older clock, which do not compare with others; those of a method without blocks
+    are the same by either."""
+    old = dict.fromkeys(each for each in CLOCKED_KEYS if result.figures.get(each) is not None)
+    if result.clock == CLOCK or result.figures.get("blocks") is None or not old:
+        return result
+    why = "Its seconds are left out: before 2026-11-29 blocks trained side by side, and pictures of the cut counted."
+    return replace(result, figures={**result.figures, **old}, reason=f"{result.reason} {why}".strip())
 
 
 def _groups(file: Path, at: str, figures: dict[str, float | None]) -> tuple[tuple[dict[str, Any], ...], dict[str, Any]]:
@@ -149,9 +164,9 @@ def _stage_seconds(output: Path, planned: PlannedRun, record: Mapping[str, Any])
 
 def _whole_seconds(run: RunFolder, stages: Sequence[str], clock: Mapping[str, float], loops: Sequence[float]) -> float:
     """From the photographs to the model, without measuring it: also starts and their stereo, V, the cut, the assignment
-    and merging, as `clock` has them by stage. Blocks in processes of their own count by what they note themselves,
-    since starting Python is no part of a method. No stage counts less than it notes itself: of one that was
-    interrupted, the clock has the last part alone.
+    and merging, as `clock` has them by stage, without pictures for people. Blocks in processes of their own count by
+    what they note themselves, since starting Python is no part of a method. No stage counts less than it notes itself:
+    of one that was interrupted, the clock has the last part alone.
 
     `loops`: seconds of the coarse training and of each block, or of a method that trains in one stage.
     """

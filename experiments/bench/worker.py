@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.bench.definitions import RECORD_FILE
+from experiments.bench.definitions import CLOCK, RECORD_FILE
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import MethodConfig
 from vdgs.config.serialization import from_dict
@@ -40,7 +40,6 @@ class BenchJob:
     lpips_weights: Path | None
     visibility_bins: int
     threads: int
-    block_jobs: int
     overwrite: bool = False
     renders: Path | None = None
     device: str = "cpu"
@@ -91,7 +90,9 @@ def _blocks(at: _JobContext) -> None:
     from vdgs.runs.open_run import load_run_blocks
 
     if at.job.device == "cpu":
-        train_blocks(at.context, CheckpointOptions(), at.job.block_jobs, at.console)
+        # One after another, each on all threads, as methods in one stage train: side by side, each on few of them, the
+        # seconds of all together would be many more than those of the stage.
+        train_blocks(at.context, CheckpointOptions(), 1, at.console)
         return
     # In this process: loading torch and its kernels for each block would take longer than many blocks of a table.
     for index in range(len(load_run_blocks(at.context.run))):
@@ -195,9 +196,10 @@ def run_job(job: BenchJob) -> None:
         record = _record(job)
         write_json(job.output / RECORD_FILE, record)  # what an interrupted run leaves is not what it was before
         for name in job.stages:
-            began = time.monotonic()
+            began, figures = time.monotonic(), context.figure_seconds
             _stage(name)(working)
-            record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
+            seconds = time.monotonic() - began - (context.figure_seconds - figures)
+            record["seconds"][name] = record["seconds"].get(name, 0.0) + seconds
             write_json(job.output / RECORD_FILE, record)
         if job.stages != ("coarse",):  # one that several runs share is not measured
             options: CaptureOptions = from_dict(CaptureOptions, job.options, "capture")
@@ -226,11 +228,12 @@ def _opened(job: BenchJob) -> Iterator[RunContext]:
 
 
 def _record(job: BenchJob) -> dict[str, Any]:
-    """What is noted so far for the same key, so that the time of an interrupted run adds up."""
+    """What is noted so far for the same key, so that the time of an interrupted run adds up. A run that began by an
+    older clock keeps it: its blocks may be trained already."""
     file = job.output / RECORD_FILE
-    before = read_json(file) if file.exists() else {}
+    before = read_json(file) if file.exists() else {"clock": CLOCK}
     seconds = before.get("seconds", {}) if before.get("key") == job.key else {}
-    return {"state": "running", "key": job.key, "seconds": seconds}
+    return {"state": "running", "key": job.key, "seconds": seconds, "clock": before.get("clock", 1)}
 
 
 def _plain(value: Any) -> Any:

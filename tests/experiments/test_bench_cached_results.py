@@ -12,8 +12,9 @@ from rich.console import Console
 
 from experiments.bench.bench import BenchSettings, run_bench
 from experiments.bench.cached_results import drop_cached_runs, match_pixel_groups, read_cached_results
+from experiments.bench.definitions import CLOCK
 from experiments.bench.plan import PlanOptions, make_plan
-from experiments.bench.results import BenchResult
+from experiments.bench.results import BenchResult, results_to_json, without_old_seconds
 from experiments.bench.scenes import SCENES
 from support.bench import InThisProcess, write_data
 from vdgs.captures.image_cache import load_image
@@ -146,6 +147,27 @@ def test_seconds_of_another_meaning_do_not_stand_beside_others(there, tmp_path):
     (tmp_path / "results.json").write_text(json.dumps(content))
     with pytest.raises(VdgsError, match="seconds are those of its steps alone"):
         read_cached_results([tmp_path / "results.json"])
+
+
+def test_seconds_by_an_older_clock_are_left_out_and_the_rest_is_taken(there, tmp_path):
+    content = json.loads(there.read_text())
+    times = {"seconds": 9.0, "preparation_seconds": 4.0, "block_seconds": 3.0, "longest_block_seconds": 2.0}
+    whole, cut = content["results"]
+    for each in (whole, cut):
+        each["figures"] |= times
+        del each["clock"]
+    cut["figures"]["blocks"] = 2
+    file = tmp_path / "results.json"
+    for _ in range(2):  # a table that was written from a file can be the file of another one
+        file.write_text(json.dumps(content))
+        results = read_cached_results([file])
+        assert times.items() <= results[whole["key"]].figures.items()  # of one stage: the same by either
+        taken = results[cut["key"]]
+        assert dict.fromkeys(times).items() <= taken.figures.items()
+        assert taken.figures["psnr"] == cut["figures"]["psnr"]
+        assert taken.reason.count("before 2026-11-29") == 1
+        content["results"] = results_to_json(list(results.values()))
+    assert without_old_seconds(replace(taken, figures=cut["figures"] | times, clock=CLOCK)).figures["seconds"] == 9.0
 
 
 @pytest.mark.parametrize("state", ["failed", "stopped", "missing"])

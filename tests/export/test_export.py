@@ -27,7 +27,8 @@ from vdgs.export import export_run as export_module
 from vdgs.export import local_bake
 from vdgs.export.bake import collect_contributions
 from vdgs.export.export_loss import ExportLoss
-from vdgs.export.export_run import RECORD_FILE, export_run, resolve_request
+from vdgs.export.export_record import RECORD_FILE, note_export
+from vdgs.export.export_run import export_run, resolve_request
 from vdgs.export.formats import html, registry
 from vdgs.export.formats.export_scene import ExportMetadata, InitialView
 from vdgs.export.gaussian_selection import rows_within_reach, select_rows
@@ -42,7 +43,7 @@ from vdgs.model.renderer import render
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
-from vdgs.system.atomic_files import read_json
+from vdgs.system.atomic_files import read_json, write_json
 from vdgs.visibility.visibility_counts import count_visibility
 
 pytestmark = pytest.mark.slow
@@ -74,7 +75,7 @@ def export(tmp_path: Path):
             model=shown,
             model_path=file,
             name="merged",
-            status=StatusRecord(),
+            status=StatusRecord(model_id="5-id"),
             key="k",
             warning="",
             capture=capture_at(origin),
@@ -145,6 +146,38 @@ def test_the_run_notes_files_within_it_as_they_lie_in_it(export, tmp_path: Path)
     paths = [str(tmp_path / name) for name in ("run/views/a.splat", "b.splat")]
     assert [file["file"] for file in record["files"]] == paths
     assert [file["file"] for file in noted["files"]] == ["views/a.splat", paths[1]]
+
+
+def test_the_record_keeps_files_of_earlier_exports_with_the_part_of_the_scene_that_each_holds(tmp_path: Path):
+    folder, outside = tmp_path / "run", tmp_path / "b.splat"
+    folder.mkdir()
+
+    def noted(*files: Path, **part: object) -> list[tuple[object, ...]]:
+        for each in files:
+            each.write_bytes(b"scene")
+        entries = [{"file": str(each), "block": None, **part} for each in files]
+        losses = [{"file": str(each), "psnr": 30.0} for each in files] + [{"file": None}]
+        note_export({"rounds": 8, "files": entries, "losses": losses}, folder, QUIET)
+        record = read_json(folder / RECORD_FILE)
+        assert [each["file"] for each in record["losses"] if each["file"]] == [row["file"] for row in record["files"]]
+        assert sum(each["file"] is None for each in record["losses"]) == 1  # that of the last export
+        return [(each["file"], each["block"]) for each in record["files"]]
+
+    assert noted(folder / "a.html", outside) == [("a.html", None), (str(outside), None)]
+    assert noted(folder / "part.html", block=0) == [("part.html", 0), ("a.html", None), (str(outside), None)]
+    assert noted(folder / "a.html", block=1) == [("a.html", 1), ("part.html", 0), (str(outside), None)]
+    outside.unlink()
+    assert noted(folder / "c.ply") == [("c.ply", None), ("a.html", 1), ("part.html", 0)]
+    for damaged in ({"files": 3, "losses": [4, {}]}, {"files": [{"file": "\0"}, None, {"file": 3}]}, [1]):
+        write_json(folder / RECORD_FILE, damaged)
+        assert noted(folder / "c.ply") == [("c.ply", None)]
+
+
+def test_a_file_is_noted_with_its_model_and_its_part(export):
+    (file,) = export("a.splat", sh_degree=0, bbox=(-50.0, -50.0, 50.0, 50.0), min_visibility=1)["files"]
+    part = {"model": "merged", "model_id": "5-id", "block": None, "bbox": [-50.0, -50.0, 50.0, 50.0]}
+    assert {key: file[key] for key in part} == part
+    assert file["min_visibility"] == 1
 
 
 def test_a_run_that_may_only_be_read_is_exported(export, tmp_path: Path):

@@ -91,6 +91,7 @@ def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, in
     find_run_motion(context, console)
     count_run_visibility(context, console)
     partition_run(context, console)
+    assert context.figure_seconds > 0
     for index in range(len(run.partition_record().blocks)):
         train_block(context, index, CheckpointOptions(), console)
     merge_run_blocks(context, False, console)

@@ -38,7 +38,7 @@ from vdgs.model.renderer import render, render_scalar_map, without_aliasing
 from vdgs.pipeline import build_lod
 from vdgs.pipeline.build_lod import build_tree
 from vdgs.runs.lod_folder import find_tree, has_lod, open_tree
-from vdgs.runs.lod_status import lod_status
+from vdgs.runs.lod_status import lod_folder, lod_status
 from vdgs.runs.open_run import ModelLocation, open_mapped
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StatusRecord
@@ -390,6 +390,12 @@ def test_a_tree_belongs_to_its_model_and_no_other(coarse, model):
     request = LodRequest(run=coarse.run.path)
     folder = build_lod.build_lod(coarse, request, console)
     build_lod.build_lod(coarse, request, console)
+    assert console.export_text(clear=False).count("nothing to do") == 1
+    at = lod_folder(coarse.run)
+    at.set_status(replace(at.status(), state="running"))  # as a process leaves it that ended before its last step
+    assert not has_lod(coarse.run, coarse.location)
+    build_lod.build_lod(coarse, request, console)
+    assert has_lod(coarse.run, coarse.location)
     assert console.export_text().count("nothing to do") == 1
     opened = open_mapped(coarse.run, coarse.location)
     drawn = open_tree(opened).at_error(0.0)

@@ -227,7 +227,7 @@ def test_who_takes_a_run_up_drives_it(place, tmp_path):
 
 def test_a_bench_does_not_begin_what_another_process_drives(run, place):
     job = BenchJob(
-        place, to_dict(CaptureOptions()), to_dict(PRESETS["laptop"]), ("coarse",), run.path, None, "key", None, 4, 1, 1,
+        place, to_dict(CaptureOptions()), to_dict(PRESETS["laptop"]), ("coarse",), run.path, None, "key", None, 4, 1,
         overwrite=True,
     )  # fmt: skip
     with driven_elsewhere(run):

@@ -18,8 +18,11 @@ from support.report_page import Page
 from vdgs.errors import RunError
 from vdgs.report import charts
 from vdgs.report.embedded_images import EmbeddedImage, load_embedded_image
+from vdgs.report.run_reader import ReportedRun
+from vdgs.report.scene_sections import html_export_link
 from vdgs.report.write_report import link_exports, write_report
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_status import get_run_status
 
 pytestmark = [pytest.mark.xdist_group("report"), pytest.mark.slow]
 
@@ -202,33 +205,45 @@ def test_the_report_of_a_whole_run_holds_its_figures(whole):
     assert page.tags.count("img") == 5 + 3 + 1 + 11
 
 
-@pytest.mark.usefixtures("blank_charts")
+def linked_page(run: RunFolder, *files: dict[str, object]) -> str:
+    """What the report leads to where these files were exported; "" where it leads to none."""
+    write(run.path / "export.json", {"files": files})
+    return html_export_link(ReportedRun(run, get_run_status(run)))
+
+
 def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
     run = coarse_run(tmp_path / "run")
     page = tmp_path / "my place&co.html"
-    page.write_text("<html></html>")
-    write(run.path / "merged/status.json", {"state": "done"})
-    write(run.path / "evaluation/metrics.json", metrics(28.375, "merged"))
-    run.merged.key_file.write_text("a key")
-    record = {"model": "merged", "key": "a key", "files": [{"file": str(page), "bytes": 7_100_000}]}
-    write(run.path / "export.json", record)
-    text = write_report(run).read_text()
-    assert '<a href="../my%20place%26co.html">Move through the scene</a>' in text
-    assert "my place&amp;co.html, 7.1 MB" in text
-    for other in ({**record, "key": "another"}, {**record, "files": []}, {"files": 3}):
-        write(run.path / "export.json", other)
-        assert "Move through" not in write_report(run).read_text()
+    page.write_bytes(b"<html></html>")
+    write(run.path / "merged/status.json", {"state": "done", "model_id": "9-whole"})
+    file = {"file": str(page), "bytes": 13, "model_id": "9-whole", "block": None, "bbox": None, "min_visibility": 0}
+    link = linked_page(run, {**file, "file": "export/scene.ply"}, file)
+    assert '<a href="../my%20place%26co.html">Move through the scene</a>' in link
+    assert "my place&amp;co.html, 0.0 MB; opens offline)" in link
+    assert "without what fewer than 3 photographs show)" in linked_page(run, {**file, "min_visibility": 3})
+    for other in ({"model_id": "8-of-one-block"}, {"model_id": None}, {"block": 0}, {"bbox": [0, 0, 1, 1]},
+                  {"bytes": 14}, {"file": str(page.with_suffix(".ply"))}):  # fmt: skip
+        assert not linked_page(run, {**file, **other}), other
+    assert not linked_page(run)
     # A page in the run is there wherever the run is moved.
     page.rename(run.path / "scene.html")
-    write(run.path / "export.json", {**record, "files": [{"file": "scene.html", "bytes": 7_100_000}]})
     run.path.rename(tmp_path / "moved")
     moved = RunFolder(tmp_path / "moved")
-    assert '<a href="scene.html">Move through the scene</a>' in write_report(moved).read_text()
-    moved.path.rename(run.path)
-    (run.path / "scene.html").rename(page)
-    write(run.path / "export.json", record)
-    page.unlink()
-    assert "Move through" not in write_report(run).read_text()
+    assert '<a href="scene.html">Move through the scene</a>' in linked_page(moved, {**file, "file": "scene.html"})
+    assert not linked_page(moved, file)
+    write(moved.path / "export.json", {"files": 3})
+    assert not html_export_link(ReportedRun(moved, get_run_status(moved)))
+
+
+def test_a_page_of_the_coarse_model_is_one_of_the_scene_until_there_is_a_merged_one(tmp_path):
+    run = coarse_run(tmp_path)
+    write(tmp_path / "coarse/status.json", {"state": "done", "model_id": "9-coarse"})
+    write(tmp_path / "scene.html", "<html></html>")
+    file = {"file": "scene.html", "bytes": 13, "model_id": "9-coarse"}
+    assert linked_page(run, file)
+    for state, is_linked in (("running", True), ("done", False)):
+        write(tmp_path / "merged/status.json", {"state": state, "model_id": "9-whole"})
+        assert bool(linked_page(run, file)) is is_linked
 
 
 @pytest.mark.usefixtures("blank_charts")

@@ -30,6 +30,19 @@ def test_the_door_knows_its_own_name():
     assert guarded.deny_reason("/", {"Host": "x", "Cookie": 'a=b; vdgs_view_7="abc"'}) is None
 
 
+@pytest.mark.parametrize(
+    "other", ['theme={"a":1}', "x=a b", "foo[1]=2", "é=1", "\udce9=\udce9", "flag", "a=1,2", 'n="a;b"', "expires=1", "",
+              "vdgs_view_7=of another day", "vdgs_view_7=\udce9"],
+)  # fmt: skip
+def test_cookies_of_other_servers_of_the_host_change_nothing(other):
+    guarded = AccessControl("0.0.0.0", "abc", 7)
+    for cookies in (f"{other}; vdgs_view_7=abc", f"vdgs_view_7=abc;{other}"):
+        assert guarded.deny_reason("/", {"Host": "x", "Cookie": cookies}) is None
+    assert guarded.deny_reason("/", {"Host": "x", "Cookie": other}) is not None
+    assert guarded.browser_of({"Cookie": f"{other}; vdgs_view_7_browser=me"}) == "me"
+    assert guarded.browser_of({"Cookie": other}) is None
+
+
 def test_why_a_visitor_is_refused_is_told_without_what_could_let_in_or_draw():
     guarded = AccessControl("0.0.0.0", "secret", 7)
     assert guarded.report("/?token=secret", {"Host": "x"}) is None

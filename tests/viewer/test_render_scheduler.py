@@ -296,6 +296,27 @@ def test_who_left_is_drawn_for_no_more(studio):
     assert not frames
 
 
+@pytest.mark.parametrize("failing_width", [320, 640])
+def test_what_is_asked_for_while_a_picture_fails_is_drawn(studio, failing_width):
+    """Of a small picture and of a full one: the visitor chooses another layer, for example."""
+    studio, clock = studio
+    broken, chosen = DisplayOptions(layer="error"), DisplayOptions()
+
+    class Fails(Slow):
+        def paint(self, display, camera, full_camera, max_anchors=None):
+            if display == broken and camera.width == failing_width:
+                studio.request_frame(seat, full_camera, chosen)
+                raise RuntimeError("no picture")
+            return super().paint(display, camera, full_camera, max_anchors)
+
+    seat, frames, errors = sit(studio, Fails(clock))
+    studio.request_frame(seat, camera_at(0, 0, width=640), broken)
+    while (wait := studio.step()) is not None:
+        clock.now += wait
+    assert [str(error) for error in errors] == ["no picture"]
+    assert [(frame.display, frame.is_full) for frame in frames[-2:]] == [(chosen, False), (chosen, True)]
+
+
 def test_one_visitors_trouble_is_theirs_alone(studio):
     studio, clock = studio
 

@@ -29,6 +29,7 @@ from vdgs.export.bake_plan import drop_unused_sh_degrees
 from vdgs.export.color_refinement import BakedGaussians
 from vdgs.export.distributed_bake import DistributedBake, distributed_bake, forget_shards
 from vdgs.export.export_loss import ExportLoss, measure_loss, views_to_measure
+from vdgs.export.export_record import note_export
 from vdgs.export.file_coordinates import FileCoordinates, axes_of_file, coordinates_of_file
 from vdgs.export.formats import registry
 from vdgs.export.formats.export_scene import CHUNK_SIZE, ExportScene, InitialView
@@ -55,15 +56,12 @@ from vdgs.model.decode_world import gaussian_means
 from vdgs.model.gaussians import Gaussians
 from vdgs.runs.open_run import OpenedRun
 from vdgs.runs.run_folder import REPORT_FILE
-from vdgs.system.atomic_files import read_json_or_empty, to_jsonable, write_json
+from vdgs.system.atomic_files import read_json_or_empty, to_jsonable
 from vdgs.system.console import make_progress_bar, print_warning
-from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject
+from vdgs.system.documents import ExportDocument, ExportedFile, JsonObject, RecordedFile
 from vdgs.system.scratch import check_takes_files, remove_leftovers
 from vdgs.system.stop_signals import check_stop_requested
 from vdgs.visibility.visibility_counts import count_visibility
-
-#: What was written and lost, beside the run's other results.
-RECORD_FILE = "export.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,33 +152,12 @@ def resolve_request(request: ExportRequest) -> ExportRequest:
 def export_run(
     run: OpenedRun, request: ExportRequest, console: Console, execution: ExecutionOptions | None = None
 ) -> ExportDocument:
-    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json: there, files
-    in the run folder by their paths from it, as it may be moved or copied."""
+    """`write_files`, in this process or in shards where `execution` sends them, noted in RUN/export.json."""
     if execution is None or not execution.is_distributed:
         forget_shards(run)
     record = write_files(run, request, console, execution)
-    try:
-        write_json(run.folder.path / RECORD_FILE, _as_noted(record, run.folder.path.resolve()))
-    except VdgsError:  # a run that may only be read
-        file = escape(str(run.folder.path / RECORD_FILE))
-        console.print(f"[yellow]note[/] {file} cannot be written: the report will not know of these files")
+    note_export(record, run.folder.path, console)
     return record
-
-
-def _as_noted(record: ExportDocument, folder: Path) -> ExportDocument:
-    """The record of a run in `folder`, its files there by their paths from it."""
-
-    def shortened(file: str) -> str:
-        path = Path(file)
-        return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else file
-
-    noted = record.copy()
-    noted["files"] = [{**each, "file": shortened(each["file"])} for each in record["files"]]
-    noted["losses"] = [
-        {**each, "file": shortened(file) if isinstance(file := each["file"], str) else None}
-        for each in record["losses"]
-    ]
-    return noted
 
 
 def write_files(
@@ -243,11 +220,17 @@ def write_files(
     if request.background is not None:
         write_background(run, request.background)
     record: ExportDocument = to_jsonable({
-        "model": run.name, "key": run.key, "gaussians": len(scene.spool.means), "sh_degree": request.baked_sh_degree,
+        "gaussians": len(scene.spool.means), "sh_degree": request.baked_sh_degree,
         "rounds": rounds, "seconds_to_bake": seconds, "seconds_to_refine": request.optimize_seconds,
-        "files": [{**each.facts, "sh_degree": each.scene.degree} for each in written.values()], "losses": losses,
+        "files": [_recorded(each, whole, request) for each in written.values()], "losses": losses,
     })  # fmt: skip
     return record
+
+
+def _recorded(written: _WrittenFile, run: OpenedRun, request: ExportRequest) -> RecordedFile:
+    """A file for the record: also which model it is of, and which part of it."""
+    return {**written.facts, "sh_degree": written.scene.degree, "model": run.name, "model_id": run.status.model_id,
+            "block": request.block, "bbox": request.bbox, "min_visibility": request.min_visibility}  # fmt: skip
 
 
 def _print_systems(systems: Mapping[Path, FileCoordinates], console: Console) -> None:

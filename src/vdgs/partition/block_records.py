@@ -56,6 +56,7 @@ class PartitionRecord:
     spatial_only_blocks: tuple[BlockRecord, ...] = ()
     """The cut that place alone would give, to compare with where visibility has a part in the cut."""
     seconds: float | None = None
+    """Of the cut and the assignment; without the figures and the cut to compare with."""
     peak_memory_bytes: int | None = None
 
 

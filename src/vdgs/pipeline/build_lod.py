@@ -37,6 +37,7 @@ from vdgs.model.lod_nodes import (
 )
 from vdgs.model.lod_quadtree import Quadtree, build_quadtree
 from vdgs.model.lod_scene import model_of_rows
+from vdgs.runs.lod_folder import has_lod
 from vdgs.runs.lod_status import lod_folder
 from vdgs.runs.model_integrity import load_verified
 from vdgs.runs.open_run import locate_model
@@ -62,7 +63,8 @@ def build_lod(context: RunContext, request: LodRequest, console: Console) -> Pat
     print_warning(console, location.warning)
     folder, model_id = lod_folder(run), location.stage.status().model_id or ""
     with folder.locked():
-        if folder.key() == _key(model_id) and (folder.path / TREE_FILE).exists():
+        # By the status too: a build that ended between the table and the status has not said yet what it made.
+        if folder.key() == _key(model_id) and has_lod(run, location):
             console.print(f"{folder.path}: the tree of this model is there; nothing to do", highlight=False)
             return folder.path
         reset_peak_memory()

@@ -40,10 +40,11 @@ def count_run_visibility(context: RunContext, console: Console) -> None:
         visibility = load_or_count_visibility(opened).numpy()
         cameras = [view.camera for view in opened.capture.train_views]
         stats = asdict(visibility_stats(visibility))
-        figures.plot_anchor_visibility(
-            run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
-            opened.capture.ground.axis_names,
-        )  # fmt: skip
+        with context.drawing_figures():
+            figures.plot_anchor_visibility(
+                run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
+                opened.capture.ground.axis_names,
+            )  # fmt: skip
         write_json(file, {"key": key, "anchors": len(visibility), "training_views": len(cameras), **stats})
     quantiles = ", ".join(f"{share} %: {value:g}" for share, value in stats["quantiles"].items())
     console.print(

@@ -77,7 +77,8 @@ def find_run_motion(context: RunContext, console: Console, device: str = "cpu") 
         }  # fmt: skip
         if record["masked"]:
             record |= {"share": search.share_of(opened.capture.train_views), "photographs": search.records()}
-            _write_examples(run.path / MOTION_EXAMPLES, opened.capture.train_views, search.records(), search.folder)
+            with context.drawing_figures():
+                _write_examples(run.path / MOTION_EXAMPLES, opened.capture.train_views, search.records(), search.folder)
         else:
             _remove_masks(search.folder, search.records())
         write_json(run.motion_file, record)

@@ -130,8 +130,10 @@ def partition_run(
             console.print(f"[yellow]note[/] {note}", highlight=False)
         rows = assignment_rows(blocks, scene.positions, scene.visibility, assignment)
         _save(run.partition, scene.opened.capture, blocks, scores, assignment, rows)
-        spatial = _spatial(scene, method.partition, method.training.seed, blocks)
-        _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
+        seconds = time.monotonic() - start
+        with context.drawing_figures():
+            spatial = _spatial(scene, method.partition, method.training.seed, blocks)
+            _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
         record = PartitionRecord(
             key=keys.partition, assignment_key=keys.assignment, strategy=method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
@@ -139,7 +141,7 @@ def partition_run(
             spatial_only_blocks=(
                 () if spatial is None else block_rows(spatial, scene.positions, scene.visibility)
             ),
-            seconds=time.monotonic() - start, peak_memory_bytes=peak_memory_bytes(),
+            seconds=seconds, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
         write_json(run.partition / "partition.json", record_to_dict(record))  # last: the rest is complete
         if is_distributed:

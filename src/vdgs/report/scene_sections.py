@@ -27,20 +27,35 @@ VISIBILITY_FILE, PARTITION_FILE = "visibility/visibility.json", "partition/parti
 
 
 def html_export_link(report: ReportedRun) -> Html:
-    """The page to move through the scene with, where `vdgs export` wrote one of the model that the run has now."""
-    run = report.run
-    record = RunFiles(run.path).record("export.json")  # its own section tells of other files that cannot be read
-    stage = run.merged if record.text("model") == "merged" else run.coarse
-    if record.text("key") is None or record.text("key") != stage.key():
-        return Html("")
+    """The page to move through the scene with, where `vdgs export` wrote one of the whole model that the run has now.
+
+    The page that was written last, where there are several; none that another file has replaced since, such as the page
+    of another run.
+    """
+    root, model_id = report.run.path.resolve(), _model_id(report)
+    record = RunFiles(report.run.path).record("export.json")  # its own section tells of other files that cannot be read
     for file in record.rows("files"):
-        page = run.path.resolve() / (file.text("file") or "")  # of the run, or an absolute path
-        if page.suffix.lower() == ".html" and page.is_file():
-            address = quote(Path(os.path.relpath(page, run.path.resolve())).as_posix())
-            size = (file.number("bytes") or 0) / 1e6
-            note = f" ({page.name}, {size:,.1f} MB; opens offline)"
+        page = root / (file.text("file") or "")  # of the run, or an absolute path
+        is_whole = not {"block", "bbox"} & {key for key, value in file.values.items() if value is not None}
+        if model_id is None or file.text("model_id") != model_id or not is_whole or page.suffix.lower() != ".html":
+            continue
+        if os.path.isfile(page) and page.stat().st_size == file.number("bytes"):
+            address = quote(Path(os.path.relpath(page, root)).as_posix())
+            fewest = file.number("min_visibility") or 0
+            edge = f"; without what fewer than {fewest:.0f} photographs show" if fewest else ""
+            note = f" ({page.name}, {page.stat().st_size / 1e6:,.1f} MB; opens offline{edge})"
             return link(address, "Move through the scene", note)
     return Html("")
+
+
+def _model_id(report: ReportedRun) -> str | None:
+    """The identity of the model that the run has now: the merged one or, where there is none, the coarse one. None
+    where neither is finished, for the settings of the run as far as that can be told."""
+    for stage in map(report.status.of, ("merge", "coarse")):
+        is_finished = stage.status is not None and stage.status.state == "done"
+        if is_finished and stage.state in ("done", "unknown") and stage.output_id:
+            return stage.output_id
+    return None
 
 
 def sfm_section(report: ReportedRun) -> Html:

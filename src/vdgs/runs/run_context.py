@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -36,6 +39,8 @@ class RunContext:
         self._doubts: list[str] | None = None
         #: By their names, each with the identity of the file that it was read from.
         self._models: dict[str, tuple[tuple[object, ...], AnchorModel]] = {}
+        #: Seconds of `drawing_figures` so far.
+        self.figure_seconds = 0.0
 
     @staticmethod
     def from_path(path: Path, capture: Path | None = None) -> RunContext:
@@ -76,6 +81,15 @@ class RunContext:
         """Forget models ("coarse", "merged"), without names all: before work that needs the memory."""
         for name in names or tuple(self._models):
             self._models.pop(name, None)
+
+    @contextmanager
+    def drawing_figures(self) -> Iterator[None]:
+        """Around what a stage makes only for people to look at: whoever compares methods by time leaves it out."""
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            self.figure_seconds += time.monotonic() - began
 
     def _model(self, location: ModelLocation, device: torch.device) -> AnchorModel:
         """The model of a finished stage. Moved to another device, it leaves the one where it was."""

@@ -116,7 +116,7 @@ class RunStatusDocument(TypedDict):
 
 
 class ExportedFile(TypedDict):
-    """A file in export.json."""
+    """A file that was exported."""
 
     #: From the run's folder where it lies in it, else absolute.
     file: str
@@ -132,17 +132,29 @@ class ExportedFile(TypedDict):
     notes: list[str]
 
 
-class ExportDocument(TypedDict):
-    """export.json of a run."""
+class RecordedFile(ExportedFile):
+    """A file in export.json."""
 
+    sh_degree: int
+    #: "coarse" or "merged", and its identity (`StatusRecord.model_id`); None where the model says none.
     model: str
-    key: str
+    model_id: str | None
+    #: Which part of the scene it holds, as it was asked for; None and 0: the whole. The box in coordinates of the file.
+    block: int | None
+    bbox: tuple[float, float, float, float] | None
+    min_visibility: int
+
+
+class ExportDocument(TypedDict):
+    """export.json of a run: its last export, with the files of earlier ones that are still there."""
+
     gaussians: int
     sh_degree: int
     rounds: int
     seconds_to_bake: float
     seconds_to_refine: float
-    files: list[ExportedFile]
+    files: list[RecordedFile]
+    """Those of the last export first."""
     losses: list[JsonObject]
 
 

@@ -12,7 +12,6 @@ import secrets
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 #: Names of the loopback address.
@@ -80,7 +79,7 @@ class AccessControl:
     def has_token(self, path: str) -> bool:
         """Whether the address itself holds the token."""
         given = parse_qs(urlsplit(path).query).get("token", [""])[0]
-        return self.token is not None and hmac.compare_digest(given.encode(), self.token.encode())
+        return self._is_token(given)
 
     def set_cookie_header(self) -> str:
         """The header's value that lets the browser in from now on: for this site's own requests only."""
@@ -88,25 +87,29 @@ class AccessControl:
 
     def browser_of(self, headers: Mapping[str, str]) -> str | None:
         """What tells a browser from others, by the cookie that it was given; None if it has none."""
-        return _cookie(headers.get("Cookie", ""), f"{self.cookie_name}_browser") or None
+        return next(filter(None, _cookies(headers.get("Cookie", ""), f"{self.cookie_name}_browser")), None)
 
     def set_browser_header(self) -> str:
         """The header's value that gives a browser such a cookie, until it is closed."""
         return f"{self.cookie_name}_browser={secrets.token_urlsafe(18)}; HttpOnly; SameSite=Strict; Path=/"
 
     def _has_cookie(self, header: str) -> bool:
-        assert self.token is not None
-        found = _cookie(header, self.cookie_name)
-        return found is not None and hmac.compare_digest(found.encode(), self.token.encode())
+        return any(map(self._is_token, _cookies(header, self.cookie_name)))
+
+    def _is_token(self, given: str) -> bool:
+        # Of bytes that are no text, headers hold surrogates.
+        return self.token is not None and hmac.compare_digest(given.encode(errors="surrogatepass"), self.token.encode())
 
 
-def _cookie(header: str, name: str) -> str | None:
-    """The value of a cookie in a Cookie header."""
-    try:
-        found = SimpleCookie(header).get(name)
-    except CookieError:
-        return None
-    return None if found is None else found.value
+def _cookies(header: str, name: str) -> list[str]:
+    """The values of the cookies of this name in a Cookie header, without quotes around them.
+
+    Split by hand: a browser sends the cookies of all servers of a host, and `http.cookies` drops all where one has a
+    name or a value that it does not expect.
+    """
+    pairs = (each.partition("=") for each in header.split(";"))
+    found = (value.strip() for key, _, value in pairs if key.strip() == name)
+    return [value[1:-1] if len(value) > 1 and value[0] == value[-1] == '"' else value for value in found]
 
 
 def _short(value: str) -> str:

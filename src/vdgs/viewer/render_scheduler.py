@@ -212,6 +212,7 @@ class RenderScheduler:
             now = self._clock()
             session = None if task else self._next(now)
             is_preview = session is not None and session.preview_due
+            requested = None if session is None else session.requested
             resting = [each.moved_at + REST_SECONDS - now for each in self._sessions if each.full_due]
         if task is not None:
             task()
@@ -222,7 +223,8 @@ class RenderScheduler:
             self._draw_preview(session) if is_preview else self._draw_next_rows(session)
         except Exception as error:  # an error of one client does not end the images of others
             with self._changed:
-                session.preview_due, session.full_due, session.job = False, False, None
+                if session.requested is requested:  # what the client asked for meanwhile stays due
+                    session.preview_due, session.full_due, session.job = False, False, None
             session.on_error(error)
         return 0
 
