@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
-CONSTRAINTS = Path(__file__).parents[1] / "constraints.txt"
+ROOT = Path(__file__).parents[1]
+CONSTRAINTS, LOWEST = ROOT / "constraints.txt", ROOT / "constraints-lowest.txt"
 #: The CUDA whose packages the index's build of a torch needs, in versions that it names.
 CUDA_OF_TORCH = {"2.13.0": "13.0"}
 
@@ -29,8 +32,8 @@ def _brought_along(package: str, extras: frozenset[str], seen: set[tuple[str, fr
             _brought_along(need.name, frozenset(need.extras), seen)
 
 
-def _pinned() -> dict[str, str]:
-    pins = re.findall(r"^([\w.-]+)==(\S+)$", CONSTRAINTS.read_text(), re.MULTILINE)
+def _pinned(file: Path = CONSTRAINTS) -> dict[str, str]:
+    pins = re.findall(r"^([\w.-]+)==(\S+)$", file.read_text(), re.MULTILINE)
     return {canonicalize_name(name): version for name, version in pins}
 
 
@@ -48,3 +51,19 @@ def test_nvrtc_is_the_one_that_torch_for_gpus_needs():
     a torch for processors do not tell."""
     pinned = _pinned()
     assert pinned["nvidia-cuda-nvrtc"].startswith(CUDA_OF_TORCH[pinned["torch"]] + ".")
+
+
+def test_the_lowest_versions_are_those_that_are_declared():
+    """But for the tools of the tests, of which any that passes them will do."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = {name: needs for name, needs in project["optional-dependencies"].items() if name not in ("test", "demo")}
+    declared = map(Requirement, [*project["dependencies"], *(need for needs in extras.values() for need in needs)])
+    minima = {
+        canonicalize_name(need.name): [a.version for a in need.specifier if a.operator == ">="] for need in declared
+    }
+    assert minima == {name: [version] for name, version in _pinned(LOWEST).items()}
+
+
+def test_the_pinned_versions_are_those_that_are_declared_or_later():
+    pinned, lowest = _pinned(), _pinned(LOWEST)
+    assert all(Version(pinned[name]) >= Version(lowest[name]) for name in lowest.keys() & pinned.keys())

@@ -83,6 +83,25 @@ def test_adobe_rgb_is_known_by_exif_alone(tmp_path):
     assert middles(decode_image(tmp_path / "_DSC1.JPG")[0]) == pytest.approx(COLORS, abs=3)
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".tif"])
+def test_photographs_without_exif_s_interoperability_are_read(tmp_path, monkeypatch, suffix):
+    """Pillow before 13 has no empty directory for them: it raises KeyError."""
+    get_ifd = Image.Exif.get_ifd
+
+    def as_before(exif: Image.Exif, tag: int) -> dict:
+        found = get_ifd(exif, tag)
+        if tag == 0xA005 and not found:
+            raise KeyError(tag)
+        return found
+
+    monkeypatch.setattr(Image.Exif, "get_ifd", as_before)
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = "2026:06:23 16:31:59"
+    Image.fromarray(patches()).save(tmp_path / f"a{suffix}", exif=exif)
+    assert read_tags(tmp_path / f"a{suffix}").kind == ""
+    assert middles(decode_image(tmp_path / f"a{suffix}")[0]) == pytest.approx(COLORS, abs=3)
+
+
 def test_transparency_stays_beside_a_profile(tmp_path):
     pixels = np.dstack([patches(in_space(DISPLAY_P3)), np.full((120, WIDE * len(COLORS)), 255, np.uint8)])
     pixels[:60, :, 3] = 0

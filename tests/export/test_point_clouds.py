@@ -3,11 +3,13 @@
 import importlib.util
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
+from support.full_disk import room_for
 from support.gaussians import random_gaussians
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.errors import VdgsError
@@ -83,6 +85,20 @@ def test_without_a_map_coordinates_are_local(tmp_path):
     place = (48.1, 11.6, 512.0)
     registry.write_scene(tmp_path / "a.las", replace(ExportScene.of(some), metadata=ExportMetadata(geodetic=place)))
     assert json.loads((tmp_path / "a.las.json").read_text())["geodetic"] == list(place)
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz"])
+@pytest.mark.parametrize("kept", [0.05, 0.5, 0.999])
+def test_points_for_which_the_disk_has_no_room_are_reported_and_absent(tmp_path, ending, kept):
+    """lazrs has an error of its own for it."""
+    path, scene = tmp_path / f"a{ending}", partial(ExportScene.of, random_gaussians(6000, 0))
+    registry.write_scene(path, scene())
+    size = path.stat().st_size
+    for file in tmp_path.iterdir():
+        file.unlink()
+    with room_for(int(kept * size)), pytest.raises(VdgsError, match=f"a{ending}: cannot be written"):
+        registry.write_scene(path, scene())
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("reach", [1e-4, 0.5, 4000.0])

@@ -2,13 +2,13 @@
 
 import errno
 import json
-import resource
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors import SafetensorError
 
+from support.full_disk import room_for
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import write_atomic
 from vdgs.system.checkpoints import Checkpoint, load_latest_checkpoint, remove_partial_files, save_checkpoint
@@ -80,13 +80,8 @@ def test_leftovers_of_a_cut_off_write_are_removed(tmp_path):
 
 def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path):
     save_checkpoint(tmp_path, state(1))
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))  # writes beyond fail, as on a full disk
-    try:
-        with pytest.raises(VdgsError, match=r"00000002\.safetensors: cannot be written.*is kept"):
-            save_checkpoint(tmp_path, state(2))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with room_for(300), pytest.raises(VdgsError, match=r"00000002\.safetensors: cannot be written.*is kept"):
+        save_checkpoint(tmp_path, state(2))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["00000001.json", "00000001.safetensors"]
     loaded, _ = load_latest_checkpoint(tmp_path)
     assert loaded is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageCms
@@ -52,10 +53,18 @@ def _profile_of(image: Image.Image) -> bytes:
     if isinstance(profile, bytes) and profile:
         return profile
     if image.format in ("JPEG", "MPO", "TIFF"):
-        interop = image.getexif().get_ifd(_INTEROP_IFD).get(1, "")
+        interop = _interoperability(image.getexif()).get(1, "")
         if isinstance(interop, str) and interop.startswith(_ADOBE_RGB):
             return matrix_profile("Adobe RGB (1998)", *ADOBE_RGB)
     return b""
+
+
+def _interoperability(exif: Image.Exif) -> dict[int, Any]:
+    """EXIF's directory of interoperability; empty where there is none, for which Pillow before 13 raises KeyError."""
+    try:
+        return exif.get_ifd(_INTEROP_IFD)
+    except KeyError:
+        return {}
 
 
 @lru_cache(16)

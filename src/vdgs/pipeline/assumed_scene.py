@@ -22,6 +22,7 @@ from vdgs.sfm.capture_writer import IMAGE_SIZES, SIDE_MULTIPLE
 from vdgs.sfm.feature_extraction import DEFAULT_FOCAL_FACTOR
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
+from vdgs.system.atomic_files import write_bytes
 
 #: Cameras of the scene, points of it at most, and views of a place where positions do not tell it (choice).
 NUM_CAMERAS, MAX_POINTS, TYPICAL_VIEWS_PER_POINT = 6, 150_000, 8.0
@@ -92,5 +93,6 @@ def _view(photo: ImageMetadata, camera: Camera, folder: Path, index: int) -> Vie
     pixels, _ = decode_image(photo.path)
     small = cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     file = folder / f"{index}.jpg"
-    cv2.imwrite(str(file), cv2.cvtColor(small, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+    quality = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
+    write_bytes(file, cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), quality)[1].tobytes())
     return View(name=file.name, camera=camera, image_path=file, mask_path=None, split="train")

@@ -24,7 +24,7 @@ from vdgs.sfm.image_metadata import FISHEYE, RADIAL, ImageMetadata
 from vdgs.sfm.mask_files import apply_orientation
 from vdgs.sfm.panoramas import cut_view, read_panorama
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress
-from vdgs.system.atomic_files import write_atomic, write_bytes
+from vdgs.system.atomic_files import write_bytes, write_image
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.stop_signals import check_stop_requested
 
@@ -188,11 +188,7 @@ def _write_upright(photo: ImageMetadata, target: Path) -> None:
 
 def _save(upright: Image.Image, target: Path, kind: str) -> None:
     options = {"quality": _UPRIGHT_QUALITY, "subsampling": 0} if kind == "JPEG" else {}
-
-    def write(file: Path) -> None:
-        upright.save(file, kind, **options)
-
-    write_atomic(target, write)
+    write_image(target, upright, kind, **options)
 
 
 def create_database(workspace: Workspace, camera_groups: Sequence[CameraGroup]) -> None:

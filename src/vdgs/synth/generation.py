@@ -36,7 +36,7 @@ from vdgs.synth.synth_options import ResolvedOptions, SynthOptions
 from vdgs.synth.synthetic_points import SeedPoints, SparseCloud, make_sparse_cloud, sample_seed_points
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.true_visibility import FlightStats, compute_flight_stats, sample_visible_points
-from vdgs.system.atomic_files import explain_disk_errors, write_text
+from vdgs.system.atomic_files import explain_disk_errors, write_image, write_text
 from vdgs.system.scratch import remove_leftovers, scratch_folder
 
 ProgressCallback = Callable[[str, int, int], None]
@@ -184,7 +184,7 @@ def _render_images(
             then = place_moving_objects(_with_waves(town, options, k), tracer, moving, options.seed, k)
             shown = render_image(*then, sky, camera, options.samples_per_pixel, views.gains[k])
             Image.fromarray(still_mask(image, shown)).save(masks / f"{Path(views.names[k]).stem}.png")
-        Image.fromarray(shown).save(folder / views.names[k], quality=95, subsampling=0)
+        write_image(folder / views.names[k], Image.fromarray(shown), "JPEG", quality=95, subsampling=0)
         if k >= views.training:
             return None
         return sample_seed_points(tracer, camera, image, per_image, np.random.default_rng([options.seed, 3, k]))
@@ -216,7 +216,7 @@ def _write_off_path(
 
     def render(view: tuple[str, Camera]) -> None:
         image = render_image(town, tracer, sky, view[1], options.samples_per_pixel, np.ones(3))
-        Image.fromarray(image).save(folder / view[0], quality=95, subsampling=0)
+        write_image(folder / view[0], Image.fromarray(image), "JPEG", quality=95, subsampling=0)
 
     on_progress("off-path images", 0, total)
     for done, _ in enumerate(pool.map(render, named), start=1):

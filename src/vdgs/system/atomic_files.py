@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
 import math
 import os
@@ -21,6 +22,7 @@ from vdgs.errors import VdgsError
 
 if TYPE_CHECKING:
     import numpy as np
+    from PIL import Image
 
 #: Free bytes of a full disk.
 FULL_DISK_BYTES = 1 << 20
@@ -116,14 +118,30 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_array(path: Path, values: np.ndarray) -> None:
-    """Write a numpy array (.npy) atomically."""
+    """Write a numpy array of any shape (.npy) atomically. Raises ValueError for Python objects, which it cannot hold.
+
+    `numpy.save` writes by `ndarray.tofile`, which loses the last block without a word: see `write_values`.
+    """
     import numpy as np  # when there is one to write: files of text do without
+
+    if values.dtype.hasobject:
+        raise ValueError("Python objects are not written to .npy files")
+    ordered = np.asarray(values, order="C")
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as handle:
-            np.save(handle, values, allow_pickle=False)
+            np.lib.format.write_array_header_1_0(handle, np.lib.format.header_data_from_array_1_0(ordered))
+            write_values(handle, ordered)
 
     write_atomic(path, write)
+
+
+def write_image(path: Path, image: Image.Image, kind: str, **options: Any) -> None:
+    """Write an image of Pillow atomically in the format `kind`, with Pillow's options for it. It is encoded in memory:
+    where Pillow itself writes a JPEG or TIFF file, it loses the end that a full disk refuses without a word."""
+    encoded = io.BytesIO()
+    image.save(encoded, kind, **options)
+    write_bytes(path, encoded.getvalue())
 
 
 def write_text(path: Path, text: str) -> None:

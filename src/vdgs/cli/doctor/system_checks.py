@@ -7,7 +7,6 @@ broken: that is when it is needed.
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import os
 import platform
 import re
@@ -16,9 +15,9 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from vdgs.cli.doctor import SystemCheck
+from vdgs.cli.doctor.requirements import Requirement, installed_version, required_packages
 from vdgs.kernels import cpu_count
 from vdgs.system.broken_packages import explain_shadows, import_reason, imported_name, reinstall_command
 from vdgs.system.cgroups import cgroup_limits, slurm_memory_limit
@@ -49,14 +48,14 @@ def _versions() -> list[SystemCheck]:
     new_enough = sys.version_info >= (3, 11)
     remedy = "" if new_enough else "Install Python 3.11 or newer."
     return [
-        SystemCheck("vdgs", "ok", _version("vdgs") or "not installed, run from a checkout"),
+        SystemCheck("vdgs", "ok", installed_version("vdgs") or "not installed, run from a checkout"),
         SystemCheck("python", "ok" if new_enough else "broken", f"{python} on {platform.platform()}", remedy, True),
     ]
 
 
 def hidden_packages() -> list[SystemCheck]:
     """The package that a file of its name hides, if any: others that import it may break in any way, or crash."""
-    required = map(imported_name, _required().get("", []))
+    required = (imported_name(each.name) for each in required_packages()[""])
     if shadow := explain_shadows((*BINARY_MODULES, *required)):
         remedy = "The command `vdgs`, unlike `python -m vdgs`, does not look into the current folder."
         return [SystemCheck("dependencies", "broken", shadow, remedy, True)]
@@ -64,24 +63,38 @@ def hidden_packages() -> list[SystemCheck]:
 
 
 def _dependencies() -> list[SystemCheck]:
-    """The packages that vdgs requires are installed, and the binary ones can be imported."""
-    required = [name for name in _required().get("", []) if name not in REMOVABLE_PACKAGES]
-    absent = [name for name in required if _version(name) is None]
+    """The packages that vdgs requires are installed in versions that will do, and the binary ones can be imported."""
+    required = [each for each in required_packages()[""] if each.name not in REMOVABLE_PACKAGES]
+    absent, unfit = _absent_and_unfit(required)
     broken = {name: error for name in BINARY_MODULES if (error := _import_error(name) or _numpy_error(name))}
-    if absent or broken:
-        remedy = f"pip install {' '.join(absent)}" if absent else reinstall_command(tuple(broken))
-        found = [f"{name} is not installed" for name in absent] + [f"{name} ({why})" for name, why in broken.items()]
-        return [SystemCheck("dependencies", "broken", ", ".join(found), remedy, True)]
-    return [SystemCheck("dependencies", "ok", "all installed, all can be imported", essential=True)]
+    if not (absent or unfit or broken):
+        return [SystemCheck("dependencies", "ok", "all installed, all can be imported", essential=True)]
+    found = [f"{each.name} is not installed" for each in absent] + list(unfit.values())
+    found += [f"{name} ({why})" for name, why in broken.items()]
+    wanted = [each.pip_words() for each in (*absent, *unfit)]
+    remedy = f"pip install {' '.join(wanted)}" if wanted else reinstall_command(tuple(broken))
+    return [SystemCheck("dependencies", "broken", ", ".join(found), remedy, True)]
+
+
+def _absent_and_unfit(required: list[Requirement]) -> tuple[list[Requirement], dict[Requirement, str]]:
+    """Packages that are not installed, and those in versions that will not do: why not."""
+    versions = {each: installed_version(each.name) for each in required}
+    absent = [each for each, version in versions.items() if version is None]
+    unfit = {each: why for each, version in versions.items() if version and (why := each.why_unfit(version))}
+    return absent, unfit
 
 
 def _removable_packages() -> list[SystemCheck]:
     """Packages that an installation may leave out: what does not work without each."""
     checks = []
-    for name, loss in REMOVABLE_PACKAGES.items():
-        error = _import_error(name)
-        value = f"{error}: {loss.split('.')[0]}" if error else _version(name) or "installed"
-        checks.append(SystemCheck(name, "missing" if error else "ok", value, f"pip install {name}" if error else ""))
+    for each in required_packages()[""]:
+        if (loss := REMOVABLE_PACKAGES.get(each.name)) is None:
+            continue
+        error, version = _import_error(each.name), installed_version(each.name)
+        why = error or (each.why_unfit(version) if version else "")
+        value = f"{why}: {loss.split('.')[0]}" if why else version or "installed"
+        remedy = f"pip install {each.pip_words()}" if why else ""
+        checks.append(SystemCheck(each.name, "missing" if why else "ok", value, remedy))
     return checks
 
 
@@ -171,19 +184,19 @@ def _cuda() -> list[SystemCheck]:
 def _extras() -> list[SystemCheck]:
     """Each optional group of packages: present, or what it would add and how to get it."""
     checks = []
-    for extra, packages in _required().items():
+    for extra, packages in required_packages().items():
         if not extra:
             continue
-        found = {name: _version(name) for name in packages}
-        absent = [name for name, version in found.items() if version is None]
-        adds = EXTRAS.get(extra, "")
-        if absent:
-            value = f"lacks {', '.join(absent)}" + (f": {adds}" if adds else "")
+        absent, unfit = _absent_and_unfit(packages)
+        adds = f": {EXTRAS[extra]}" if extra in EXTRAS else ""
+        if absent or unfit:
+            lacks = [f"lacks {', '.join(each.name for each in absent)}"] if absent else []
+            value = ", ".join((*lacks, *unfit.values())) + adds
             checks.append(SystemCheck(f"extra {extra}", "missing", value, f"pip install 'vdgs[{extra}]'"))
         else:
-            listed = ", ".join(f"{name} {version}" for name, version in list(found.items())[:3])
-            listed += f" and {len(found) - 3} more" if len(found) > 3 else ""
-            checks.append(SystemCheck(f"extra {extra}", "ok", listed + (f": {adds}" if adds else "")))
+            listed = ", ".join(f"{each.name} {installed_version(each.name)}" for each in packages[:3])
+            listed += f" and {len(packages) - 3} more" if len(packages) > 3 else ""
+            checks.append(SystemCheck(f"extra {extra}", "ok", listed + adds))
     return checks
 
 
@@ -225,41 +238,6 @@ def _disk() -> list[SystemCheck]:
     if usage.free < MIN_FREE_DISK_BYTES:
         return [SystemCheck("disk", "note", value, "Free some space: a run with its blocks may take several GB.")]
     return [SystemCheck("disk", "ok", value)]
-
-
-def _required() -> dict[str, list[str]]:
-    """Packages by extra ("" holds what vdgs always requires), from the installed metadata, else from the checkout's
-    pyproject.toml. The extras of vdgs that an extra includes are left out: they have lines of their own."""
-    try:
-        requirements = importlib.metadata.requires("vdgs") or []
-    except importlib.metadata.PackageNotFoundError:
-        requirements = _checkout_requirements()
-    groups: dict[str, list[str]] = {"": []}
-    for requirement in requirements:
-        marker = re.search(r"""extra\s*==\s*['"]([^'"]+)['"]""", requirement)
-        name = re.match(r"[A-Za-z0-9._-]+", requirement)
-        if name and name.group() != "vdgs":
-            groups.setdefault(marker.group(1) if marker else "", []).append(name.group())
-    return groups
-
-
-def _checkout_requirements() -> list[str]:
-    import tomllib
-
-    file = Path(__file__).parents[4] / "pyproject.toml"
-    if not file.is_file():
-        return []
-    project: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
-    extras = project.get("optional-dependencies", {}).items()
-    optional = (f"{package}; extra == '{extra}'" for extra, packages in extras for package in packages)
-    return [*project["dependencies"], *optional]
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _import_error(module: str) -> str:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,7 +106,7 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     header = _las_header(path, scene.metadata, scale)
 
     def write(temporary: Path) -> None:
-        with temporary.open("wb") as file, laspy.open(
+        with _lazrs_errors_as_oserror(compressed), temporary.open("wb") as file, laspy.open(
             file, mode="w", header=header, do_compress=compressed, closefd=False
         ) as writer:  # fmt: skip
             origin = np.array(scene.metadata.origin)
@@ -121,6 +123,20 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
     else:
         write_metadata_file(path, scene.metadata, Z_UP)
     return (*of_system, *LOSS_NOTES, f"coordinates are rounded to {scale:g} {scene.metadata.unit}")
+
+
+@contextmanager
+def _lazrs_errors_as_oserror(compressed: bool) -> Iterator[None]:
+    """OSError for what lazrs raises of its own where the disk refuses a block of points."""
+    if not compressed:
+        yield
+        return
+    import lazrs
+
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        raise OSError(str(error)) from error
 
 
 def _las_header(path: Path, metadata: ExportMetadata, scale: float) -> laspy.LasHeader:
