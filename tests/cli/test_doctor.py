@@ -135,7 +135,7 @@ def test_a_dependency_that_is_too_old_has_its_command(monkeypatch: pytest.Monkey
     """pip leaves it in place where what needs it was installed before."""
     require(monkeypatch, always=[Requirement("numpy", ">=1.26"), Requirement("pillow", ">=99.1,<100")])
     (check,) = doctor._dependencies()
-    assert check.value == f"pillow {version('pillow')} is installed, vdgs needs >=99.1,<100"
+    assert check.value == f"pillow {version('pillow')} is installed, but >=99.1,<100 is required"
     assert check.remedy == "pip install 'pillow>=99.1,<100'"
     assert print_report(checks=[check]) == 1
     assert "Not usable yet: dependencies" in capsys.readouterr().out
@@ -147,10 +147,10 @@ def test_what_may_be_left_out_may_be_too_old(monkeypatch: pytest.MonkeyPatch):
     )
     (check,) = doctor._removable_packages()
     assert (check.state, check.is_ok, check.remedy) == ("missing", True, "pip install 'pycolmap>=99'")
-    assert "vdgs needs >=99" in check.value or "No module named" in check.value
+    assert "but >=99 is required" in check.value or "No module named" in check.value
     (check,) = doctor._extras()
     assert (check.state, check.is_ok, check.remedy) == ("missing", True, "pip install 'vdgs[geo]'")
-    assert check.value.startswith(f"lacks no, numpy {version('numpy')} is installed, vdgs needs >=99: ")
+    assert check.value.startswith(f"lacks no, numpy {version('numpy')} is installed, but >=99 is required: ")
 
 
 def test_versions_are_compared_as_packaging_compares_them():

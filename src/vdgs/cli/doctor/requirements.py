@@ -34,7 +34,7 @@ class Requirement:
         bounds = filter(None, map(_BOUND.fullmatch, self.versions.split(",")))
         if all(_is_within(installed, bound[1], bound[2]) for bound in bounds):
             return ""
-        return f"{self.name} {installed} is installed, vdgs needs {self.versions}"
+        return f"{self.name} {installed} is installed, but {self.versions} is required"
 
     def pip_words(self) -> str:
         """What to write behind `pip install` for a version that will do, quoted for the shell."""
