@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from itertools import pairwise
 
 import pytest
 
-from vdgs.sfm.films.telemetry import read_subtitles, read_telemetry, telemetry_at
+from vdgs.errors import CaptureError
+from vdgs.sfm.films.subtitle_files import read_subtitles
+from vdgs.sfm.films.telemetry import read_telemetry, telemetry_at
 
 
 @pytest.mark.parametrize(
@@ -153,3 +156,47 @@ def test_positions_between_records_on_both_sides_of_the_antimeridian_lie_between
     records = read_telemetry(blocks)
     for seconds, expected in ((0.25, 179.99999), (0.75, -179.99999)):
         assert telemetry_at(records, seconds).lat_lon == pytest.approx((-16.8, expected), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        ("[latitude: 33.5S] [longitude: 70.6 W]", (-33.5, -70.6)),
+        ("[latitude: -33.5S] [longitude: -70.6W]", (-33.5, -70.6)),
+        ("GPS(W: -70.6, S: -33.5)", (-33.5, -70.6)),
+        ("GPS(W: 70.6, S: 33.5)", (-33.5, -70.6)),
+        ("HOME(lat: 1.5, lon: 2.5) [latitude: 47.1] [longitude: 8.2]", (47.1, 8.2)),
+        ("[latitude: 47 07.407] [longitude: 8°12.5'E]", (47.12345, 8.208333)),
+        ("[latitude: 33.5E] [longitude: 70.6W]", None),
+        ("lat: 47.1 12:03:04 lon: 8.2 13", (47.1, 8.2)),
+    ],
+)
+def test_angles_have_sides_minutes_and_are_not_those_of_the_take_off(words, place):
+    found = [record.lat_lon for record in read_telemetry([(0.0, f"H 10.0m {words}")])]
+    assert found == [place and pytest.approx(place, abs=1e-6)]
+
+
+def _srt(starts, first, clock=0.0):
+    times = [f"00:00:{int(t):02d},{round(1000 * (t % 1)):03d}" for t in (*starts, 2 * starts[-1] - starts[-2])]
+    return "".join(
+        f"{k}\n{one} --> {other}\n2026-06-01 10:00:{int(clock + k):02d} [latitude: {first + k}] [longitude: 8.0]\n\n"
+        for k, (one, other) in enumerate(pairwise(times))
+    )
+
+
+def test_joined_subtitles_follow_each_other_where_they_are_as_long_as_the_film():
+    one, other = _srt(range(10), 10), _srt(range(5), 40, clock=20)
+    for film_s in (15.0, 14.2):
+        records = read_telemetry(read_subtitles(one + other, film_s))
+        assert [record.lat_lon for record in records] == [(lat, 8.0) for lat in (*range(10, 20), *range(40, 45))]
+        assert records[10].seconds == pytest.approx(10, abs=0.5)
+    for text, film_s in ((one + other, 30.0), (one + one, 10.0), (other + one, 15.0)):
+        with pytest.raises(CaptureError, match="its times begin again, as of 2 files"):
+            read_subtitles(text, film_s)
+    assert read_subtitles(one, 60.0) == read_subtitles(one)
+
+
+def test_blocks_out_of_order_are_no_joined_files():
+    parts = _srt(range(10), 10).split("\n\n")
+    whole, turned = (read_telemetry(read_subtitles("\n\n".join(each))) for each in (parts, parts[5:] + parts[:5]))
+    assert turned == whole
