@@ -8,6 +8,7 @@ from itertools import pairwise
 import pytest
 
 from vdgs.errors import CaptureError
+from vdgs.sfm.films.record_bends import RecordBends
 from vdgs.sfm.films.subtitle_files import read_subtitles
 from vdgs.sfm.films.telemetry import read_telemetry, telemetry_at
 
@@ -200,3 +201,26 @@ def test_blocks_out_of_order_are_no_joined_files():
     parts = _srt(range(10), 10).split("\n\n")
     whole, turned = (read_telemetry(read_subtitles("\n\n".join(each))) for each in (parts, parts[5:] + parts[:5]))
     assert turned == whole
+
+
+def _records(metres: list[tuple[float, float]], decimals: int, step_s: float = 1.0):
+    words = ((47 + north / 111e3, 8 + east / 76e3) for east, north in metres)
+    text = (f"[latitude: {lat:.{decimals}f}] [longitude: {lon:.{decimals}f}]" for lat, lon in words)
+    return read_telemetry([(step_s * k, each) for k, each in enumerate(text)])
+
+
+def test_between_two_records_around_a_turn_there_is_no_position():
+    """That would cut the corner, on the inner side of the flight."""
+    there_and_back = [(15.0 * k, 0.0) for k in (0, 1, 2, 3, 2.5, 1.5, 0.5)]
+    records = _records(there_and_back, 7)
+    bends = RecordBends(records)
+    placed = [bends.checked(telemetry_at(records, t)).lat_lon is not None for t in (0.5, 1.5, 3.0, 3.3, 3.7, 5.5)]
+    assert placed == [True, True, True, False, False, True]
+
+
+@pytest.mark.parametrize(("decimals", "step_m"), [(4, 11.1), (5, 1.11), (7, 0.0)])
+def test_rounding_on_a_straight_way_is_no_turn(decimals, step_m):
+    records = _records([(3.1 * k, 4.3 * k) for k in range(40)], decimals)
+    bends = RecordBends(records)
+    assert bends.step_m == pytest.approx(step_m, rel=0.01)
+    assert all(bends.checked(telemetry_at(records, t / 4)).lat_lon is not None for t in range(156))

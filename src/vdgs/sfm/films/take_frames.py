@@ -36,6 +36,7 @@ from vdgs.sfm.films.film_reader import (
 )
 from vdgs.sfm.films.frame_choice import MOTION_WIDTH, SHARPNESS_WIDTH, FrameChooser, MotionTracker, sharpness
 from vdgs.sfm.films.frame_files import encode_frame, with_tags
+from vdgs.sfm.films.record_bends import RecordBends
 from vdgs.sfm.films.subtitle_files import subtitle_files
 from vdgs.sfm.films.telemetry import Telemetry, telemetry_at
 from vdgs.sfm.find_images import films_in
@@ -47,7 +48,7 @@ from vdgs.system.content_digests import ContentDigests, find_copies
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.stop_signals import check_stop_requested
-from vdgs.system.units import duration, first_names
+from vdgs.system.units import duration, first_names, two_digits
 
 #: So many frames a second are looked at.
 LOOKS_PER_SECOND = 15.0
@@ -288,12 +289,18 @@ def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: 
             last = _look(film, chooser, tell)
         chosen = chooser.finish()
         subtitles = film.telemetry()
-        placed = 0
+        bends, placed, beside = RecordBends(subtitles.records), 0, 0
         for file in chosen:
-            known = telemetry_at(subtitles.records, moments[file])
+            between = telemetry_at(subtitles.records, moments[file])
+            known = bends.checked(between)
+            beside += known is not between
             placed += known.lat_lon is not None
             moment = _moment(film, known, moments[file])
             write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
+        if beside:
+            film.notes.append(f"{beside} frames between records on both sides of a turn have no position")
+        if bends.step_m > 1:
+            film.notes.append(f"its subtitles round positions to {two_digits(bends.step_m)} m")
         summary = _summary(film, len(chosen), placed, last, subtitles)
     return FilmRecord(film=str(path.resolve()), most=most, frames=len(chosen), summary=summary)
 
