@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from itertools import pairwise
 
 import pytest
 
-from vdgs.sfm.films.telemetry import read_subtitles, read_telemetry, telemetry_at
+from vdgs.errors import CaptureError
+from vdgs.sfm.films.record_bends import RecordBends
+from vdgs.sfm.films.subtitle_files import read_subtitles
+from vdgs.sfm.films.telemetry import read_telemetry, telemetry_at
 
 
 @pytest.mark.parametrize(
@@ -153,3 +157,70 @@ def test_positions_between_records_on_both_sides_of_the_antimeridian_lie_between
     records = read_telemetry(blocks)
     for seconds, expected in ((0.25, 179.99999), (0.75, -179.99999)):
         assert telemetry_at(records, seconds).lat_lon == pytest.approx((-16.8, expected), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        ("[latitude: 33.5S] [longitude: 70.6 W]", (-33.5, -70.6)),
+        ("[latitude: -33.5S] [longitude: -70.6W]", (-33.5, -70.6)),
+        ("GPS(W: -70.6, S: -33.5)", (-33.5, -70.6)),
+        ("GPS(W: 70.6, S: 33.5)", (-33.5, -70.6)),
+        ("HOME(lat: 1.5, lon: 2.5) [latitude: 47.1] [longitude: 8.2]", (47.1, 8.2)),
+        ("[latitude: 47 07.407] [longitude: 8°12.5'E]", (47.12345, 8.208333)),
+        ("[latitude: 33.5E] [longitude: 70.6W]", None),
+        ("lat: 47.1 12:03:04 lon: 8.2 13", (47.1, 8.2)),
+    ],
+)
+def test_angles_have_sides_minutes_and_are_not_those_of_the_take_off(words, place):
+    found = [record.lat_lon for record in read_telemetry([(0.0, f"H 10.0m {words}")])]
+    assert found == [place and pytest.approx(place, abs=1e-6)]
+
+
+def _srt(starts, first, clock=0.0):
+    times = [f"00:00:{int(t):02d},{round(1000 * (t % 1)):03d}" for t in (*starts, 2 * starts[-1] - starts[-2])]
+    return "".join(
+        f"{k}\n{one} --> {other}\n2026-06-01 10:00:{int(clock + k):02d} [latitude: {first + k}] [longitude: 8.0]\n\n"
+        for k, (one, other) in enumerate(pairwise(times))
+    )
+
+
+def test_joined_subtitles_follow_each_other_where_they_are_as_long_as_the_film():
+    one, other = _srt(range(10), 10), _srt(range(5), 40, clock=20)
+    for film_s in (15.0, 14.2):
+        records = read_telemetry(read_subtitles(one + other, film_s))
+        assert [record.lat_lon for record in records] == [(lat, 8.0) for lat in (*range(10, 20), *range(40, 45))]
+        assert records[10].seconds == pytest.approx(10, abs=0.5)
+    for text, film_s in ((one + other, 30.0), (one + one, 10.0), (other + one, 15.0)):
+        with pytest.raises(CaptureError, match="its times begin again, as of 2 files"):
+            read_subtitles(text, film_s)
+    assert read_subtitles(one, 60.0) == read_subtitles(one)
+
+
+def test_blocks_out_of_order_are_no_joined_files():
+    parts = _srt(range(10), 10).split("\n\n")
+    whole, turned = (read_telemetry(read_subtitles("\n\n".join(each))) for each in (parts, parts[5:] + parts[:5]))
+    assert turned == whole
+
+
+def _records(metres: list[tuple[float, float]], decimals: int, step_s: float = 1.0):
+    words = ((47 + north / 111e3, 8 + east / 76e3) for east, north in metres)
+    text = (f"[latitude: {lat:.{decimals}f}] [longitude: {lon:.{decimals}f}]" for lat, lon in words)
+    return read_telemetry([(step_s * k, each) for k, each in enumerate(text)])
+
+
+def test_between_two_records_around_a_turn_there_is_no_position():
+    """That would cut the corner, on the inner side of the flight."""
+    there_and_back = [(15.0 * k, 0.0) for k in (0, 1, 2, 3, 2.5, 1.5, 0.5)]
+    records = _records(there_and_back, 7)
+    bends = RecordBends(records)
+    placed = [bends.checked(telemetry_at(records, t)).lat_lon is not None for t in (0.5, 1.5, 3.0, 3.3, 3.7, 5.5)]
+    assert placed == [True, True, True, False, False, True]
+
+
+@pytest.mark.parametrize(("decimals", "step_m"), [(4, 11.1), (5, 1.11), (7, 0.0)])
+def test_rounding_on_a_straight_way_is_no_turn(decimals, step_m):
+    records = _records([(3.1 * k, 4.3 * k) for k in range(40)], decimals)
+    bends = RecordBends(records)
+    assert bends.step_m == pytest.approx(step_m, rel=0.01)
+    assert all(bends.checked(telemetry_at(records, t / 4)).lat_lon is not None for t in range(156))

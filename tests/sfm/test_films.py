@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import shutil
 import sys
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,6 +25,7 @@ from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm.films import take_frames
+from vdgs.sfm.films.film_reader import open_film
 from vdgs.sfm.films.frame_choice import STEP, FrameChooser, MotionTracker, sharpness
 from vdgs.sfm.films.high_dynamic_range import to_standard_range
 from vdgs.sfm.films.take_frames import film_changes, temporary_frames, with_frames
@@ -32,7 +35,7 @@ from vdgs.sfm.reconstruct import reconstruct
 
 pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
 
-pytest.importorskip("av")
+av = pytest.importorskip("av")
 #: Stands for 1 s, then moves by 5 of 200 pixels a frame.
 LEFTS = [0] * 10 + [5 * k for k in range(40)]
 
@@ -419,3 +422,82 @@ def test_moments_without_a_clock_in_the_film(tmp_path: Path):
     moments = [datetime.strptime(photo.datetime, "%Y:%m:%d %H:%M:%S") for photo in images.images]
     assert moments == sorted(moments)
     assert (moments[0], moments[-1]) == (datetime(2026, 6, 1, 10, 0, 57), datetime(2026, 6, 1, 10, 0, 59))
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
+def test_positions_are_those_of_frames_also_where_a_film_starts_late(tmp_path: Path, name: str):
+    words = [f"[latitude: {47 + k * 1e-5:.6f}] [longitude: 8.2]" for k in range(30)]
+    write_film(tmp_path / name, crops(panorama(), [5 * k for k in range(30)]), 10.0, words, start_s=5.0)
+    images, said = take(ask(tmp_path / "out", tmp_path / name))
+    assert "positions of its subtitles" in said
+    assert "cut off" not in said
+    for photo in images.images:
+        number = int(photo.path.stem.rpartition("_")[2])
+        assert photo.lat_lon == pytest.approx((47 + number * 1e-5, 8.2), abs=2e-7)
+
+
+def test_damaged_frames_are_left_out_up_to_the_next_key_frame(tmp_path: Path):
+    pictures = crops(panorama(), [5 * k for k in range(40)])
+    write_film(tmp_path / "a.mp4", pictures, x264="keyint=10:min-keyint=10:scenecut=0:bframes=0")
+    content = bytearray((tmp_path / "a.mp4").read_bytes())
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        packet = next(packet for k, packet in enumerate(film.demux(video=0)) if k == 12)
+        content[packet.pos + 40 : packet.pos + packet.size] = np.random.default_rng(1).bytes(packet.size - 40)
+    (tmp_path / "a.mp4").write_bytes(content)
+    images, said = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    decoded = [int(photo.path.stem.rpartition("_")[2]) for photo in images.images]
+    numbers = [number + (number >= 12) for number in decoded]
+    assert not {*numbers} & {*range(12, 20)}
+    assert max(numbers) > 30
+    assert "1 packets are damaged" in said
+    assert re.search(r"frames of [01]\.\d s are damaged, and left out", said)
+    for number, photo in zip(numbers, images.images, strict=True):
+        assert np.abs(np.asarray(Image.open(photo.path)).astype(float) - pictures[number]).mean() < 6
+
+
+def test_what_lies_beside_a_film_without_positions_is_named(tmp_path: Path):
+    film = tmp_path / "flight.mp4"
+    write_film(film, crops(panorama(), [6 * k for k in range(20)]))
+    track = tmp_path / "track.gpx"
+    track.write_text('<?xml version="1.0"?>\n<gpx><trkpt lat="1" lon="2"/></gpx>')
+    (tmp_path / "DJI_1.SRT").write_text("1\n00:00:00,000 --> 00:00:02,000\n[latitude: 47.0] [longitude: 8.2]\n")
+    _, said = take(ask(tmp_path / "out", film))
+    assert "DJI_1.SRT beside it: rename it to flight.SRT" in said
+    assert "track.gpx beside it has some by time" in said
+    assert "exiftool -geotag" in said
+    for table, why in ((track, "Films: once the frames are taken"), (tmp_path / "DJI_1.SRT", "Put it beside the film")):
+        with pytest.raises(CaptureError, match=why):
+            take(replace(ask(tmp_path / "other", film), gps=table))
+    assert not (tmp_path / "other").exists(), "before the film is decoded"
+    (tmp_path / "DJI_1.SRT").rename(tmp_path / "flight.mp4.SRT")
+    assert "positions of flight.mp4.SRT" in take(ask(tmp_path / "named", film))[1]
+
+
+def test_films_of_other_suffixes_are_read_and_proxies_are_named(tmp_path: Path):
+    write_film(tmp_path / "a.mp4", crops(panorama(), [6 * k for k in range(20)]))
+    for suffix in (".ts", ".mpg", ".3gp", ".webm"):
+        (tmp_path / suffix[1:]).mkdir()
+        shutil.copy(tmp_path / "a.mp4", tmp_path / suffix[1:] / f"a{suffix}")
+        assert len(films_in([tmp_path / suffix[1:]])) == 1
+    (tmp_path / "low").mkdir()
+    proxy = shutil.copy(tmp_path / "a.mp4", tmp_path / "low" / "GL01.LRV")
+    for path in (proxy, tmp_path / "low"):
+        with pytest.raises(CaptureError, match="low resolution"):
+            collect_images([path])
+
+
+def test_focal_lengths_of_subtitles_keep_their_fractions(tmp_path: Path):
+    words = ["[focal_len: 24.40] [latitude: 47.0] [longitude: 8.2]"] * 20
+    write_film(tmp_path / "a.mp4", crops(panorama(), [6 * k for k in range(20)]), 10.0, words)
+    images, _ = take(ask(tmp_path / "out", tmp_path / "a.mp4"))
+    lens = images.images[0].lens
+    assert lens is not None
+    assert lens.focal == pytest.approx(24.4 / np.hypot(36, 24) * np.hypot(200, 160) / 200, rel=1e-4)
+
+
+def test_frames_after_a_corrupt_one_are_broken_up_to_the_next_key_frame(flight: Path):
+    """As decoders hide what is damaged, of a picture and of those that are made of it."""
+    with open_film(flight) as film:
+        shown = [(4, False, False), (5, True, False), (6, False, False), (7, False, True), (8, False, False)]
+        pictures = [SimpleNamespace(pts=pts, is_corrupt=bad, key_frame=key) for pts, bad, key in shown]
+        assert [film._is_whole(picture) for picture in pictures] == [True, False, False, True, True]

@@ -27,14 +27,18 @@ def write_film(
     rotation: int = 0,
     x264: str = "",
     pixels: str = "yuv420p",
+    start_s: float = 0.0,
 ) -> None:
-    """Pictures [h, w, 3] uint8, each with its subtitle where there are any; `moments` are seconds, not even ones."""
+    """Pictures [h, w, 3] uint8, each with its subtitle where there are any; `moments` are seconds, not even ones;
+    the film's clock shows `start_s` at its first frame."""
     import av
 
-    with av.open(str(file), "w", options={"movflags": "use_metadata_tags"}) as container:
+    options = {"movflags": "use_metadata_tags"} if file.suffix.lower() in (".mp4", ".mov") else {}
+    with av.open(str(file), "w", options=options) as container:
         container.metadata.update(metadata or {})
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-        words = container.add_mux_stream("mov_text") if subtitles else None
+        coding = "subrip" if file.suffix.lower() == ".mkv" else "mov_text"
+        words = container.add_mux_stream(coding) if subtitles else None
         for number, picture in enumerate(pictures):
             if not number:
                 stream.set_display_rotation(rotation)
@@ -42,13 +46,13 @@ def write_film(
                 stream.pix_fmt = pixels
                 stream.options = {"crf": "12", "preset": "ultrafast", "x264-params": x264}
                 stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-            moment = round(1000 * (number / fps if moments is None else moments[number]))
+            moment = round(1000 * (start_s + (number / fps if moments is None else moments[number])))
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             frame.pts, frame.time_base = moment, Fraction(1, 1000)
             container.mux(stream.encode(frame))
             if words is not None:
                 text = subtitles[number].encode()
-                packet = av.Packet(len(text).to_bytes(2, "big") + text)
+                packet = av.Packet(len(text).to_bytes(2, "big") + text if coding == "mov_text" else text)
                 packet.stream, packet.time_base = words, Fraction(1, 1000)
                 packet.pts = packet.dts = moment
                 packet.duration = round(1000 / fps)

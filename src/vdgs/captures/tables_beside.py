@@ -72,14 +72,24 @@ def _count(names: Sequence[str], rows: Sequence[GpsRow], file: Path) -> int:
 
 def track_notes(folders: Iterable[Path]) -> list[str]:
     """How to use tracks in the folders, which have positions by time, for photographs that have none."""
-    found = []
-    for file in _candidates(folders, _TRACK_SUFFIXES):
-        try:
-            read_gps_table(file)
-        except CaptureError as error:
-            if str(error).endswith(BY_TIME):
-                found.append(f"positions beside the photographs, which say none, are not used: {error}")
-    return found
+    return [
+        f"positions beside the photographs, which say none, are not used: {why}" for why in tracks(folders).values()
+    ]
+
+
+def tracks(folders: Iterable[Path]) -> dict[Path, str]:
+    """The tracks in the folders, which have positions by time, and why they are no tables of photographs."""
+    found = ((file, why_track(file)) for file in _candidates(folders, _TRACK_SUFFIXES))
+    return {file: why for file, why in found if why}
+
+
+def why_track(file: Path) -> str:
+    """Why a file is no table of photographs, if that is because it has positions by time; else empty."""
+    try:
+        read_gps_table(file)
+    except CaptureError as error:
+        return str(error) if str(error).endswith(BY_TIME) else ""
+    return ""
 
 
 def control_point_notes(folders: Iterable[Path]) -> list[str]:

@@ -15,6 +15,7 @@ from vdgs.captures.image_suffixes import (
     IMAGE_SUFFIXES,
     JPEG_SUFFIXES,
     OTHER_IMAGE_SUFFIXES,
+    PROXY_SUFFIXES,
     RAW_SUFFIXES,
     VIDEO_SUFFIXES,
 )
@@ -60,7 +61,7 @@ class Found:
 
     def notes(self) -> list[str]:
         """What people should know of what is not used."""
-        kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES]
+        kinds = [kind for kind in self.unread if kind not in VIDEO_SUFFIXES | PROXY_SUFFIXES]
         notes = [f"{said}."] if (said := self.films_beside()) else []
         notes += [f"{_count(self.unread[kind], kind)} not read: {_remedy(kind)}." for kind in kinds]
         notes += [
@@ -203,7 +204,7 @@ def _count_other(found: Found, path: Path, stems: set[str]) -> None:
     found.others += path.is_file()
     if is_archive(path):
         found.archives.append(path.name)
-    if suffix in OTHER_IMAGE_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in stems:
+    if suffix in OTHER_IMAGE_SUFFIXES | VIDEO_SUFFIXES | PROXY_SUFFIXES and path.stem.lower() not in stems:
         found.unread[suffix] += 1
         if suffix in VIDEO_SUFFIXES:
             found.films.append(path.name)
@@ -260,6 +261,8 @@ def _remedy(suffix: str) -> str:
         return "convert them to JPEG, with their tags (djxl IN.jxl OUT.jpg, of libjxl, or: magick mogrify -format jpg)"
     if suffix in JPEG_SUFFIXES:
         return "they are JPEG; rename them to .jpg"
+    if suffix in PROXY_SUFFIXES:
+        return "copies of films in low resolution (proxies); give the films themselves"
     if suffix in VIDEO_SUFFIXES:
         return "name the films themselves"
     return "convert them to JPEG, PNG or TIFF, with their tags"

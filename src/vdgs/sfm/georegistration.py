@@ -15,18 +15,17 @@ from vdgs.captures.position_weights import are_told, relative_deviations, weighi
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
-from vdgs.geometry.similarity import Similarity, is_collinear
+from vdgs.geometry.similarity import Similarity
 from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.position_lines import are_along_a_line
 from vdgs.sfm.recorded_headings import checked_by_headings
 from vdgs.sfm.up_direction import camera_rotation, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
 
-#: Positions fix a turn about a line if they spread across it this many times their standard deviation.
-MIN_SPREAD_SIGMAS = 3.0
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
 #: distance is found of about so many photographs.
 MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
@@ -119,7 +118,7 @@ def georegister(
     if positions.table is not None and positions.has_altitudes and not anyway:
         refuse_unit(_unit(fit, problem, positions), "the cameras", positions.table)
     fit, of_reading = _checked_reading(fit, problem, positions)
-    on_a_line = is_nearly_collinear(targets[fit.inliers], positions.gps_std[rows][fit.inliers])
+    on_a_line = are_along_a_line(*(each[fit.inliers] for each in (targets, positions.gps_std[rows], fit.deviations)))
     fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
     fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
@@ -432,14 +431,6 @@ def registration_in_place(
         accuracy=accuracy,
         notes=notes,
     )
-
-
-def is_nearly_collinear(points: np.ndarray, std: np.ndarray) -> bool:
-    """Whether places [n, 3] leave a turn about a line open: they spread across it no more than they may be wrong."""
-    if is_collinear(points):
-        return True
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(points))
-    return bool(spread < MIN_SPREAD_SIGMAS * np.sqrt(np.median((std**2).mean(axis=1))))
 
 
 def transform_model(model: pycolmap.Reconstruction, similarity: Similarity) -> None:

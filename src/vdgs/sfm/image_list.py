@@ -12,7 +12,7 @@ from typing import NamedTuple
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import decode_image
-from vdgs.captures.image_suffixes import HEIF_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
+from vdgs.captures.image_suffixes import HEIF_SUFFIXES, IMAGE_SUFFIXES, PROXY_SUFFIXES, RAW_SUFFIXES
 from vdgs.captures.name_resolution import jpeg_name, match_key
 from vdgs.captures.nested_captures import check_no_foreign_file, foreign_poses, model_below
 from vdgs.captures.output_guard import is_capture
@@ -125,6 +125,11 @@ def _check_folder(folder: Path) -> None:
         check_no_foreign_file(folder)
         if is_archive(folder):
             raise CaptureError(f"{folder}: is an archive. Unpack it, and give the folder of the photographs.")
+        if folder.suffix.lower() in PROXY_SUFFIXES and folder.is_file():
+            raise CaptureError(
+                f"{folder}: is a copy of a film in low resolution (a proxy). Give the film itself (.MP4), or rename "
+                f"the copy to {shell_word(folder.stem + '.mp4')} where there is nothing better."
+            )
         what = "is a file, and no film" if folder.is_file() else "no such folder or film"
         raise CaptureError(f"{folder}: {what}. Give the folder that the photographs are in.")
     check_no_run(folder)

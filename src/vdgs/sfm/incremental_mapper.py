@@ -23,9 +23,9 @@ from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_information import focal_deviation
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
-from vdgs.sfm.georegistration import is_nearly_collinear
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, FISHEYE, ImageMetadata
+from vdgs.sfm.position_lines import is_nearly_collinear
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.reprojection import drop_unseen_observations, mean_reprojection_error
 from vdgs.sfm.workspace import Workspace, call_cancellable, report_progress

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,11 +16,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from vdgs.captures.name_resolution import to_nfc
-from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
 from vdgs.sfm.films.high_dynamic_range import HDR_TRANSFERS, to_standard_range
-from vdgs.sfm.films.telemetry import Telemetry, places, read_subtitles, read_telemetry
+from vdgs.sfm.films.subtitle_files import read_subtitle_file, subtitle_files
+from vdgs.sfm.films.telemetry import Telemetry, places, read_telemetry
 from vdgs.sfm.image_metadata import MIN_SIDE_PX
 from vdgs.system.quoting import shell_word
 
@@ -47,6 +47,16 @@ class FilmFrame(NamedTuple):
     picture: Any
 
 
+class Subtitles(NamedTuple):
+    """What subtitles say of the moments of a film."""
+
+    records: tuple[Telemetry, ...]
+    source: str
+    """Which they are, also where they say nothing; empty where there are none."""
+    refused: str = ""
+    """Why they cannot be used."""
+
+
 @dataclass(kw_only=True)
 class Film:
     """An open film."""
@@ -55,6 +65,9 @@ class Film:
     container: Any
     stream: Any
     seconds: float
+    """How long it is; 0 where it does not say that."""
+    start: float
+    """When its first frame is shown by the clock of its tracks, in seconds."""
     camera: tuple[str, str]
     """Maker and model; empty where the film does not say them."""
     created: datetime | None
@@ -63,29 +76,51 @@ class Film:
     notes: list[str] = field(default_factory=list)
     damaged: int = 0
     """Packets that could not be decoded."""
+    damaged_s: float = 0.0
+    """How long frames are shown that are damaged, or made of such, and left out."""
+    count: int = 0
+    """Frames that were read."""
+    shown_s: float = 0.0
+    """The moment of the last frame that was read."""
+    _is_broken: bool = False
+    _broken_pts: float = -math.inf
+    """Of the last packet that could not be decoded."""
     subtitles: list[tuple[float, str]] = field(default_factory=list)
     """Those that were read on the way."""
 
     def frames(self) -> Iterator[FilmFrame]:
-        """All frames in order. Raises CaptureError for what cannot become photographs."""
-        number = 0
-        start = float((self.stream.start_time or 0) * self.stream.time_base)
+        """All frames in order, but for damaged ones. Raises CaptureError for what cannot become photographs."""
+        whole = 0
         for picture in self._pictures():
-            if not number:
+            if not self.count:
                 _check(self, picture)
-            moment = (
-                float(picture.time) - start if picture.time is not None else number / (self.stream.average_rate or 25)
-            )
-            yield FilmFrame(number, moment, picture)
-            number += 1
-        if not number:
-            raise CaptureError(f"{self.path}: none of its frames can be decoded. Copy the film again.")
+            before, self.shown_s = self.shown_s, self.count / float(self.stream.average_rate or 25)
+            if picture.time is not None:
+                self.shown_s = float(picture.time) - self.start
+            if self._is_whole(picture):
+                yield FilmFrame(self.count, self.shown_s, picture)
+                whole += 1
+            else:
+                self.damaged_s += max(0.0, self.shown_s - before)
+            self.count += 1
+        if not whole:
+            why = "are whole" if self.count else "can be decoded"
+            raise CaptureError(f"{self.path}: none of its frames {why}. Copy the film again.")
+
+    def _is_whole(self, picture: Any) -> bool:
+        """Whether nothing is damaged of a picture, and of those that it is made of: up to the next key frame each is
+        made of the one before it. Decoders tell of a packet before they give the pictures of those before it."""
+        if picture.key_frame and (picture.pts is None or picture.pts > self._broken_pts):
+            self._is_broken = False
+        self._is_broken |= picture.is_corrupt
+        return not self._is_broken
 
     def _pictures(self) -> Iterator[Any]:
         from av.error import FFmpegError
 
         tracks = [self.stream, *self.container.streams.subtitles]
         packets = self.container.demux(tracks)
+        packet = None
         while True:
             try:
                 packet = next(packets, None)
@@ -96,6 +131,9 @@ class Film:
                     continue
                 yield from packet.decode()
             except FFmpegError:  # what follows may be whole
+                self._is_broken = True
+                if packet is not None and packet.stream is self.stream and packet.pts is not None:
+                    self._broken_pts = packet.pts
                 self.damaged += 1
                 if self.damaged > 1000:
                     return
@@ -105,25 +143,24 @@ class Film:
         if packet.stream.codec_context.name == "mov_text":
             words = words[2 : 2 + int.from_bytes(words[:2], "big")]
         if words and packet.pts is not None:
-            self.subtitles.append((float(packet.pts * packet.time_base), words.decode("utf-8", errors="replace")))
+            seconds = float(packet.pts * packet.time_base) - self.start
+            self.subtitles.append((seconds, words.decode("utf-8", errors="replace")))
 
-    def telemetry(self) -> tuple[tuple[Telemetry, ...], str]:
-        """What its subtitles say, once its frames were read, or else the file of subtitles beside it; and which, also
-        where they say nothing; empty where there are none."""
-        found = [(read_telemetry(self.subtitles, self.place), "its subtitles")] if self.subtitles else []
-        if not any(any(places(records)) for records, _ in found):
-            found += [
-                (read_telemetry(read_subtitles(decode_text(file.read_bytes())), self.place), file.name)
-                for file in subtitle_files(self.path)
-            ]
-        found.sort(key=lambda each: (not any(places(each[0])), not each[0]))
-        return found[0] if found else ((), "")
+    def telemetry(self) -> Subtitles:
+        """What its subtitles say, once its frames were read, or else the file of subtitles beside it."""
+        found = [Subtitles(read_telemetry(self.subtitles, self.place), "its subtitles")] if self.subtitles else []
+        if not any(any(places(each.records)) for each in found):
+            found += [self._telemetry_beside(file) for file in subtitle_files(self.path)]
+        found.sort(key=lambda each: (not any(places(each.records)), not each.records))
+        return found[0] if found else Subtitles((), "")
 
-
-def subtitle_files(film: Path) -> list[Path]:
-    """The files of subtitles beside a film: of its name in any case."""
-    stem = to_nfc(film.stem).lower()
-    return [file for file in sorted(film.parent.glob("*.[sS][rR][tT]")) if to_nfc(file.stem).lower() == stem]
+    def _telemetry_beside(self, file: Path) -> Subtitles:
+        try:
+            return Subtitles(
+                read_telemetry(read_subtitle_file(file, self.seconds or self.shown_s), self.place), file.name
+            )
+        except CaptureError as error:
+            return Subtitles((), file.name, str(error))
 
 
 @contextmanager
@@ -146,9 +183,12 @@ def open_film(path: Path) -> Iterator[Film]:
         stream.thread_type = "AUTO"
         tags = {**stream.metadata, **container.metadata}
         tags = {key.lower(): value for key, value in tags.items()}
+        start = float((stream.start_time or 0) * stream.time_base)
         seconds = float((container.duration or 0) / av.time_base)
+        if container.format.name.startswith("matroska"):  # which counts until the end, not from the first frame
+            seconds = max(0.0, seconds - start)
         yield Film(
-            path=path, container=container, stream=stream, seconds=seconds, camera=_camera(tags),
+            path=path, container=container, stream=stream, seconds=seconds, start=start, camera=_camera(tags),
             created=_created(tags), place=_start_place(tags),
         )  # fmt: skip
 

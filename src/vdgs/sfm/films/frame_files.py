@@ -53,7 +53,7 @@ def _exif(film: str, camera: tuple[str, str], moment: datetime | None, known: Te
         details[0x9003] = f"{moment:%Y:%m:%d %H:%M:%S}"
         details[0x9291] = f"{moment.microsecond // 1000:03d}"
     if known.focal_35mm:
-        details[0xA405] = round(known.focal_35mm)
+        details[0xA405] = _whole_or_rational(known.focal_35mm)
     exif[_EXIF_IFD] = details
     if known.lat_lon is not None:
         exif[_GPS_IFD] = _gps(known.lat_lon, known.altitude)
@@ -79,6 +79,12 @@ def _sexagesimal(degrees: float) -> tuple[IFDRational, ...]:
 
 def _rational(value: float, parts: int) -> IFDRational:
     return IFDRational(Fraction(round(value * parts), parts))
+
+
+def _whole_or_rational(value: float) -> int | IFDRational:
+    """EXIF's FocalLengthIn35mmFilm, which is a whole number by its standard; with a fraction where it has one, which
+    programs read all the same: half a millimetre is 2 % of a wide lens."""
+    return int(value) if value == int(value) else _rational(value, 1000)
 
 
 def _xmp(film: str, known: Telemetry) -> bytes:

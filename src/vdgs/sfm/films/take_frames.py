@@ -23,19 +23,22 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.films.film_positions import check_table, what_is_said
 from vdgs.sfm.films.film_reader import (
     Film,
     FilmFrame,
+    Subtitles,
     color_picture,
     gray_picture,
     open_film,
     shrink,
-    subtitle_files,
     upright_size,
 )
 from vdgs.sfm.films.frame_choice import MOTION_WIDTH, SHARPNESS_WIDTH, FrameChooser, MotionTracker, sharpness
 from vdgs.sfm.films.frame_files import encode_frame, with_tags
-from vdgs.sfm.films.telemetry import Telemetry, places, telemetry_at
+from vdgs.sfm.films.record_bends import RecordBends
+from vdgs.sfm.films.subtitle_files import subtitle_files
+from vdgs.sfm.films.telemetry import Telemetry, telemetry_at
 from vdgs.sfm.find_images import films_in
 from vdgs.sfm.image_list import MIN_IMAGES
 from vdgs.sfm.reconstruction_plan import check_output_folder
@@ -45,7 +48,7 @@ from vdgs.system.content_digests import ContentDigests, find_copies
 from vdgs.system.file_locks import lock_folder
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.stop_signals import check_stop_requested
-from vdgs.system.units import duration, first_names
+from vdgs.system.units import duration, first_names, two_digits
 
 #: So many frames a second are looked at.
 LOOKS_PER_SECOND = 15.0
@@ -82,8 +85,7 @@ def temporary_frames(request: SfmRequest, console: Console) -> Iterator[SfmReque
     if not films:
         yield request
         return
-    check_output(request.output)
-    check_output_folder(request.output)  # before the frames are taken, which lasts
+    _check(request, films)
     digests = read_digests(request.output)
     if (request.output / SOURCE_IMAGES_FILE).exists() and not request.overwrite:
         _check_same(request, films, digests)
@@ -104,13 +106,20 @@ def with_frames(request: SfmRequest, console: Console, run: RunFolder | None = N
     if not films:
         return request
     check_ranges(request)
-    check_output(request.output)
-    check_output_folder(request.output)
+    _check(request, films)
     digests = read_digests(request.output)
     if (request.output / SOURCE_IMAGES_FILE).exists() and not request.overwrite:
         _check_same(request, films, digests)
     with run.drive_lock() if run is not None else nullcontext(), lock_folder(request.output):
         return replace(request, image_folders=_take(request, request.output, console, digests))
+
+
+def _check(request: SfmRequest, films: Sequence[Path]) -> None:
+    """Raise, before frames are taken, which lasts, what would be raised later."""
+    check_output(request.output)
+    check_output_folder(request.output)
+    if request.gps is not None:
+        check_table(request.gps, films[0])
 
 
 def _films(request: SfmRequest) -> tuple[list[Path], dict[Path, Path]]:
@@ -279,14 +288,20 @@ def _take_frames(path: Path, folder: Path, most: int, work: Workspace, console: 
         with report_progress(work, console, "frames", max(1, round(film.seconds)), f"{escape(path.name)}, ") as tell:
             last = _look(film, chooser, tell)
         chosen = chooser.finish()
-        records, source = film.telemetry()
-        placed = 0
+        subtitles = film.telemetry()
+        bends, placed, beside = RecordBends(subtitles.records), 0, 0
         for file in chosen:
-            known = telemetry_at(records, moments[file])
+            between = telemetry_at(subtitles.records, moments[file])
+            known = bends.checked(between)
+            beside += known is not between
             placed += known.lat_lon is not None
             moment = _moment(film, known, moments[file])
             write_bytes(file, with_tags(file.read_bytes(), folder.name, film.camera, moment, known))
-        summary = _summary(film, len(chosen), placed, last, records, source)
+        if beside:
+            film.notes.append(f"{beside} frames between records on both sides of a turn have no position")
+        if bends.step_m > 1:
+            film.notes.append(f"its subtitles round positions to {two_digits(bends.step_m)} m")
+        summary = _summary(film, len(chosen), placed, last, subtitles)
     return FilmRecord(film=str(path.resolve()), most=most, frames=len(chosen), summary=summary)
 
 
@@ -310,22 +325,15 @@ def _moment(film: Film, known: Telemetry, seconds: float) -> datetime | None:
     return known.moment or (film.created and film.created + timedelta(seconds=seconds))
 
 
-def _summary(film: Film, count: int, placed: int, last: FilmFrame, records: Sequence[Telemetry], source: str) -> str:
+def _summary(film: Film, count: int, placed: int, last: FilmFrame, subtitles: Subtitles) -> str:
     """96 of 2,400 frames of 1 min 20 s, 3840 x 2160; positions of its subtitles."""
     width, height = upright_size(last.picture)
-    size = f"{width} x {height}"
-    said = f"positions of {source}" + (f" for {placed} of the frames" if placed < count else "")
-    if not any(places(records)) and source:
-        said = f"no positions: none is understood in {source} (without GPS, or without a fix?); give a table with --gps"
-    elif not any(places(records)):
-        said = "no positions"
-        said += " (drones write them into subtitles where captions are switched on; or give a table with --gps)"
-    elif not placed:
-        said = f"no positions: those of {source} are of other times ({duration(records[0].seconds)} to "
-        said += f"{duration(records[-1].seconds)}); the subtitles of another film?"
-    notes = [said, *film.notes]
+    notes = [what_is_said(film.path, count, placed, subtitles), *film.notes]
     if film.damaged:
         notes.append(f"{film.damaged} packets are damaged, their frames left out")
-    if last.seconds < 0.9 * film.seconds - 1:
-        notes.append(f"ends after {duration(last.seconds)}: cut off?")
-    return f"{count:,} of {last.number + 1:,} frames in {duration(last.seconds)}, {size}; {'; '.join(notes)}"
+    if film.damaged_s > 0:
+        notes.append(f"frames of {duration(film.damaged_s)} are damaged, and left out")
+    if film.shown_s < 0.9 * film.seconds - 1:
+        notes.append(f"ends after {duration(film.shown_s)}: cut off?")
+    size = f"{width} x {height}"
+    return f"{count:,} of {film.count:,} frames in {duration(film.shown_s)}, {size}; {'; '.join(notes)}"

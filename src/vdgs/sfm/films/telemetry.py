@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from itertools import pairwise
 
-from vdgs.captures.angles import LIMITS, side_of
+from vdgs.captures.angles import LIMITS, degrees_of_text, side_of
 from vdgs.captures.table_columns import FOOT_M
 
 #: Between records that are farther apart than this (seconds) nothing is interpolated.
@@ -30,9 +30,12 @@ MAX_DRIFT_S, MAX_DRIFT = 1.0, 0.05
 _NUMBER = r"([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"
 _ALONE = r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)(?![.,]?\d)"
 _LENGTH = rf"{_ALONE}\s*(m|ft|feet)?\b"
-_TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _TAGS = re.compile(r"<[^>]{0,200}>")
 _MOMENT = re.compile(r"(\d{4})[-.:/](\d\d)[-.:/](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:[.,](\d{1,3}))?")
+#: Where the drone took off, not where it is.
+_HOME = re.compile(r"\bHOME\s*:?\s*(?:\([^)]*\)|\[[^\]]*\]|\{[^}]*\})", re.IGNORECASE)
+#: What may follow a number in an angle: minutes and seconds, their signs, and a side.
+_REST_OF_ANGLE = re.compile(r"[ \t\d.°º'′’\"″”]*(?:[NSEW](?![\w:]))?", re.IGNORECASE)
 _FIX = re.compile(r"\b(?:GPS|RTK)\s*\(([^)]{1,100})\)")
 _GIMBAL = re.compile(r"G\.PRY\s*\(([^)]{1,100})")
 _HEIGHT = re.compile(rf"(?:\bBAROMETER\s*:?|\bH)\s*{_LENGTH}", re.IGNORECASE)
@@ -72,17 +75,6 @@ class _Pair:
     numbers: tuple[float, float]
     in_capital_m: bool
     """Whether an altitude in M is the third, as drones write it that write the latitude first (Matrice 300, XT2)."""
-
-
-def read_subtitles(text: str) -> list[tuple[float, str]]:
-    """The blocks of a file of subtitles (.SRT): when each begins, in seconds, and its words."""
-    marks = list(_TIMES.finditer(text))
-    ends = ([mark.start() for mark in marks] + [len(text)])[1:]
-    return [
-        (3600 * int(mark[1]) + 60 * int(mark[2]) + int(mark[3]) + int(mark[4].ljust(3, "0")) / 1000,
-         text[mark.end() : end])
-        for mark, end in zip(marks, ends, strict=True)
-    ]  # fmt: skip
 
 
 def read_telemetry(
@@ -186,8 +178,11 @@ def _between(one: float | None, other: float | None, share: float) -> float | No
 
 def _read(seconds: float, words: str) -> tuple[Telemetry, _Pair | None]:
     """What a block says, and two numbers that are latitude and longitude in an order that is not said."""
+    words = _HOME.sub(" ", words)
     values = {name: _quantity(match) for name, pattern in _KEYED.items() if (match := pattern.search(words))}
-    place = _place(values["latitude"], values["longitude"]) if {"latitude", "longitude"} <= values.keys() else None
+    is_named = {"latitude", "longitude"} <= values.keys()
+    latitude, longitude = (_angle(words, axis) for axis in LIMITS) if is_named else (None, None)
+    place = None if latitude is None or longitude is None else _place(latitude, longitude)
     sided, unnamed, altitude = _fix(words) if place is None else (None, None, None)
     height = _HEIGHT.search(words)
     relative = values.get("relative", _quantity(height) if height else None)
@@ -201,7 +196,7 @@ def _read(seconds: float, words: str) -> tuple[Telemetry, _Pair | None]:
         relative_altitude=relative,
         focal_35mm=_focal(words, values),
         gimbal=gimbal,
-        moment=_moment(words),
+        moment=moment_of(words),
     )
     return record, unnamed
 
@@ -209,6 +204,25 @@ def _read(seconds: float, words: str) -> tuple[Telemetry, _Pair | None]:
 def _quantity(match: re.Match[str]) -> float:
     """A number and what follows it: as it is, in metres where it is in feet."""
     return float(match[1].replace(",", ".")) * (FOOT_M if (match[2] or "").lower().startswith("f") else 1.0)
+
+
+def _angle(words: str, axis: str) -> float | None:
+    """The latitude or longitude that words name: decimal, or with minutes, and with a side or a sign; None for what is
+    no such angle."""
+    match = _KEYED[axis].search(words)
+    if match is None:
+        return None
+    number, rest = match[1].replace(",", "."), _REST_OF_ANGLE.match(words, match.end(1))
+    behind = rest[0].strip() if rest else ""
+    if not behind or ("." in number and behind[0].isdigit()):  # another number
+        return float(number)
+    found = degrees_of_text(f"{number.lstrip('+-')} {behind}", axis)
+    return None if found is None else _signed(found[0], is_negative=number.startswith("-"))
+
+
+def _signed(angle: float, *, is_negative: bool) -> float:
+    """An angle whose side may be written twice, as a letter and as a sign."""
+    return -abs(angle) if is_negative else angle
 
 
 def _parts(listed: str) -> list[str]:
@@ -245,7 +259,8 @@ def _fix(words: str) -> tuple[tuple[float, float] | None, _Pair | None, float | 
             return None, None, None
         axis = "latitude" if (match[1] or "").upper() in ("N", "S") else "longitude"
         if match[1]:
-            sides[axis] = (side_of(match[1], axis) or 1.0) * float(match[2])
+            side = (side_of(match[1], axis) or 1.0) * abs(float(match[2]))
+            sides[axis] = _signed(side, is_negative=float(match[2]) < 0)
         plain.append(float(match[2]))
     if len(sides) == 2:
         return _place(sides["latitude"], sides["longitude"]), None, altitude
@@ -288,7 +303,8 @@ def _focal(words: str, values: dict[str, float]) -> float | None:
     return focal * max(zoom, 1.0) if 5 <= focal <= 2000 else None
 
 
-def _moment(words: str) -> datetime | None:
+def moment_of(words: str) -> datetime | None:
+    """The moment that words state, by a clock of their own."""
     found = _MOMENT.search(words)
     if found is None:
         return None
