@@ -13,7 +13,7 @@ pycolmap = pytest.importorskip("pycolmap")
 
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
-from vdgs.sfm import incremental_mapper, mapping, view_stretch  # noqa: E402
+from vdgs.sfm import incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
 from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
 from vdgs.sfm.focal_length import Lens  # noqa: E402
@@ -229,30 +229,23 @@ def test_one_tag_is_contradicted_by_little_where_photographs_plainly_tell_it(
     assert not incremental_mapper.is_contradicted(model, held, [GROUP], 1)
 
 
-@pytest.mark.parametrize("settles", [True, False])
-def test_a_released_focal_length_that_ends_where_its_fit_begins_is_fitted_anew(tmp_path, monkeypatch, settles):
-    """Points that were made by a wrong focal length hold it there."""
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_a_focal_length_of_one_tag_that_photographs_tell_is_fitted_anew(tmp_path, monkeypatch, confirmed):
+    """Points that were made by a wrong focal length hold it there, however it is fitted afterwards."""
+    told = (False, incremental_mapper.OF_SHAPE)
     mapper = Mapper({True: model_of(FOCAL), False: model_of(1.14 * FOCAL)})
-
-    def fit(model, _threads):
-        if settles:
-            model.cameras[1].focal_length = 1.14 * FOCAL
-
-    monkeypatch.setattr(view_stretch, "fit_focal", fit)
     monkeypatch.setattr(incremental_mapper, "should_fix_focal", lambda *_: (True, OF_FLIGHTS))
-    monkeypatch.setattr(
-        incremental_mapper, "release_focal",
-        lambda models, *_: fit(models[0], 1) or (False, incremental_mapper.OF_SHAPE),
-    )  # fmt: skip
+    monkeypatch.setattr(incremental_mapper, "release_focal", lambda *_: told)
     plan = SimpleNamespace(
         image_list=SimpleNamespace(images=[]), threads=1, gps_priors=None,
-        request=SimpleNamespace(options=SfmOptions(camera_model="radial")),
+        request=SimpleNamespace(options=SfmOptions()),
     )  # fmt: skip
     monkeypatch.setattr(incremental_mapper, "run_mapper", mapper)
     monkeypatch.setattr(mapping.global_mapper, "leaves_photographs_out", lambda _: False)
-    groups, console = [replace(GROUP, is_confirmed=False)], Console(quiet=True)
-    for _ in range(2):  # the same command goes on from what is made
-        models, held = mapping.map_photographs(plan, Workspace(tmp_path), groups, "key", 6, console)
-        assert models[0].cameras[1].focal_length == pytest.approx(1.14 * FOCAL)
-        assert held == (False, incremental_mapper.OF_SHAPE if settles else incremental_mapper.CONTRADICTED)
-    assert mapper.made == ([True] if settles else [True, False])
+    silence_colmap()
+    groups, console = [replace(GROUP, is_confirmed=confirmed)], Console(quiet=True)
+    monkeypatch.setattr(mapping.fisheyes, "candidates", lambda *_: [])
+    models, held = mapping.map_photographs(plan, Workspace(tmp_path), groups, "key", 6, console)
+    assert models[0].cameras[1].focal_length == pytest.approx((1.0 if confirmed else 1.14) * FOCAL)
+    assert mapper.made == ([True] if confirmed else [True, False])
+    assert not held[0]

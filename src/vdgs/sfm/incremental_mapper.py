@@ -54,7 +54,7 @@ OF_PARALLEL = "several heights, but views so parallel that the photographs canno
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
 ASKED = "asked for"
 TAGS_DISAGREE = "what the photographs say of it contradicts itself"
-CONTRADICTED = "held at what one tag alone says of it, the photographs fit together plainly worse"
+CONTRADICTED = "one tag alone says it, and the photographs tell it better"
 CONFIRMED = "tags that agree say it, and the photographs cannot tell it: fitted, it went astray"
 #: A fitted focal length contradicts the held one where points lie nearer to where they are seen by this share (choice),
 #: and the two are no one value as tags go (`AGREE`). Over ground that does not tell it neither is so.
@@ -240,6 +240,21 @@ def is_contradicted(
 def focals_by_one_tag(groups: Sequence[CameraGroup]) -> dict[int, float]:
     """Focal lengths (pixels) that one tag alone says, by the numbers of the cameras."""
     return {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
+
+
+def is_told_of_one_tag(
+    model: pycolmap.Reconstruction, meant: tuple[bool, str], held: tuple[bool, str], groups: Sequence[CameraGroup]
+) -> bool:
+    """Whether the photographs tell a focal length that was `meant` to be held at what one tag alone says. Points that a
+    wrong one made hold it where it was, however it is fitted: those that a camera shows which turns on the spot, to
+    which it gives a depth. Such a model is made anew."""
+    placed = {image.camera_id for image in placed_images(model)}
+    return (
+        meant[0]
+        and meant[1] != OF_LINE
+        and held == (False, OF_SHAPE)
+        and bool(focals_by_one_tag(groups).keys() & placed)
+    )
 
 
 def is_astray(model: pycolmap.Reconstruction, held: tuple[bool, str], groups: Sequence[CameraGroup]) -> bool:

@@ -13,7 +13,6 @@ from vdgs.sfm import fisheyes, global_mapper, incremental_mapper
 from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
-from vdgs.sfm.view_stretch import is_unsettled
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.lazy_pycolmap import pycolmap
 
@@ -64,8 +63,8 @@ def _mapped_as_told(
             return models, held
         if incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
             why = "the photographs contradict the focal length that is held; it is fitted, all anew"
-        elif meant[0] and not held[0] and is_unsettled(models[0], kinds, plan.threads):
-            why = "the focal length that is released ends where its fit begins; it is fitted, all anew"
+        elif incremental_mapper.is_told_of_one_tag(models[0], meant, held, kinds):
+            why = "the photographs tell the focal length that one tag alone says; it is fitted, all anew"
         elif not meant[0] and incremental_mapper.is_astray(models[0], held, kinds):
             why = "the fitted focal length is far from what tags that agree say; it is held, all anew"
             incremental_mapper.set_models_aside(workspace, workspace.models_fitted)

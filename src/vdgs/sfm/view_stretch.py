@@ -17,14 +17,13 @@ from vdgs.captures.plane_fit import ENOUGH_TO_DOUBT, LEAST_M
 from vdgs.captures.position_adjustment import DRIFT_M, PositionFit, Problem
 from vdgs.captures.position_fit import fit_positions
 from vdgs.sfm.capture_writer import placed_images
-from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import FIXED_M, flights_of
 from vdgs.sfm.focal_information import focal_deviation
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
 from vdgs.sfm.georegistration import Georegistration, match_positions, problem_of, viewing_distance
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
-from vdgs.sfm.incremental_mapper import ASKED, MIN_OBLIQUE_SHARE, adjust, fit_focal, focals_by_one_tag
+from vdgs.sfm.incremental_mapper import ASKED, MIN_OBLIQUE_SHARE, adjust
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.up_direction import up_of
 from vdgs.system.lazy_pycolmap import pycolmap
@@ -47,8 +46,6 @@ NEARLY_ALL = 0.9
 DOWN_COSINE = 0.9
 #: Heights that leave more open (share) say nothing against a drift of altitudes (choice).
 TELLING = 0.1
-#: A fit that begins with focal lengths so many times as long ends at the same ones but for such a share (choices).
-BEGUN_LONGER, SETTLED = 1.15, 0.01
 #: Rounds in which weights settle, and the degrees of freedom of Student's t by which errors spread.
 ROUNDS, TAILS = 15, 3.0
 BY_ALTITUDES, BY_BAROMETER = "recorded altitudes", "recorded heights over the take-off"
@@ -102,7 +99,7 @@ def find_stretch(
     for is not changed. `stated`: as for `georegister`."""
     images = placed_images(model)
     views = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
-    axis = _mean_view(model)
+    axis = views.mean(axis=0) / max(float(np.linalg.norm(views.mean(axis=0))), 1e-12)
     is_oblique = np.mean(views @ axis < math.cos(math.radians(OBLIQUE_ANGLE_DEG))) >= MIN_OBLIQUE_SHARE
     if is_oblique or _are_bound(model):
         return None
@@ -131,33 +128,8 @@ def find_stretch(
 def stretched(model: pycolmap.Reconstruction, stretch: Stretch, threads: int) -> pycolmap.Reconstruction:
     """A model with focal lengths and depths along the axis as many times as large, adjusted with the focal lengths
     held: views are not quite parallel. Computes the errors of points."""
-    found = _deepened(model, stretch.axis, math.exp(stretch.log))
-    adjust(found, threads, hold_focal=True)
-    return found
-
-
-def is_unsettled(model: pycolmap.Reconstruction, groups: Sequence[CameraGroup], threads: int) -> bool:
-    """Whether the fitted focal length of a model, held before at what one tag alone says, depends on where its fit
-    begins: points that were made by a wrong one hold it there, as those that a camera shows which turns on the spot,
-    to which a wrong focal length gives a depth."""
-    lenses = focals_by_one_tag(groups).keys() & {image.camera_id for image in placed_images(model)}
-    if not lenses:
-        return False
-    other = _deepened(model, _mean_view(model), BEGUN_LONGER)
-    fit_focal(other, threads)
-    ends = [other.cameras[k].mean_focal_length() / model.cameras[k].mean_focal_length() for k in lenses]
-    return any(abs(math.log(end)) > SETTLED for end in ends)
-
-
-def _mean_view(model: pycolmap.Reconstruction) -> np.ndarray:
-    views = np.array([image.cam_from_world().rotation.matrix()[2] for image in placed_images(model)])
-    return np.asarray(views.mean(axis=0) / max(float(np.linalg.norm(views.mean(axis=0))), 1e-12))
-
-
-def _deepened(model: pycolmap.Reconstruction, axis: np.ndarray, factor: float) -> pycolmap.Reconstruction:
-    """A model with focal lengths and depths along an axis [3] so many times as large."""
-    found = pycolmap.Reconstruction(model)
-    deeper = np.eye(3) + (factor - 1) * np.outer(axis, axis)
+    found, factor = pycolmap.Reconstruction(model), math.exp(stretch.log)
+    deeper = np.eye(3) + (factor - 1) * np.outer(stretch.axis, stretch.axis)
     for image in placed_images(found):
         turned = image.cam_from_world().rotation.matrix()
         pose = pycolmap.Rigid3d(np.column_stack([turned, -turned @ deeper @ image.projection_center()]))
@@ -166,6 +138,7 @@ def _deepened(model: pycolmap.Reconstruction, axis: np.ndarray, factor: float) -
         point.xyz = deeper @ point.xyz
     for camera in found.cameras.values():
         camera.params = _stretched_lens(camera, factor)
+    adjust(found, threads, hold_focal=True)
     return found
 
 
