@@ -201,3 +201,52 @@ def test_fitting_the_focal_length_leaves_the_log_of_colmap_silent(capfd):
     assert model.cameras[1].focal_length == pytest.approx(before, rel=0.02)
     pycolmap.logging.info("told")
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("fitted", "nearer", "deviation", "contradicted"),
+    [(1.14, 0.14, 0.005, True), (1.14, 0.07, 0.005, False), (1.03, 0.14, 0.001, False), (1.14, 0.14, 0.05, False),
+     (1.3, 0.07, 0.05, True)],
+)  # fmt: skip
+def test_one_tag_is_contradicted_by_little_where_photographs_plainly_tell_it(
+    monkeypatch, fitted, nearer, deviation, contradicted
+):
+    """A subtitle said 24 mm of a lens of 27.4: within what tags differ by, but points lie 14 % nearer by the latter."""
+    model = model_of(FOCAL)
+
+    def fit(model, _threads):
+        model.cameras[1].focal_length = fitted * FOCAL
+
+    monkeypatch.setattr(incremental_mapper, "fit_focal", fit)
+    monkeypatch.setattr(
+        incremental_mapper,
+        "mean_reprojection_error",
+        lambda each: 1.0 if each.cameras[1].focal_length == FOCAL else 1.0 - nearer,
+    )
+    monkeypatch.setattr(incremental_mapper, "focal_deviation", lambda _: deviation)
+    held = (True, incremental_mapper.OF_ONE_HEIGHT)
+    by_one = replace(GROUP, is_confirmed=False)
+    assert incremental_mapper.is_contradicted(model, held, [by_one], 1) is contradicted
+    assert not incremental_mapper.is_contradicted(model, held, [GROUP], 1)
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_a_focal_length_of_one_tag_that_photographs_tell_is_fitted_anew(tmp_path, monkeypatch, confirmed):
+    """Points that were made by a wrong focal length hold it there, however it is fitted afterwards."""
+    told = (False, incremental_mapper.OF_SHAPE)
+    mapper = Mapper({True: model_of(FOCAL), False: model_of(1.14 * FOCAL)})
+    monkeypatch.setattr(incremental_mapper, "should_fix_focal", lambda *_: (True, OF_FLIGHTS))
+    monkeypatch.setattr(incremental_mapper, "release_focal", lambda *_: told)
+    plan = SimpleNamespace(
+        image_list=SimpleNamespace(images=[]), threads=1, gps_priors=None,
+        request=SimpleNamespace(options=SfmOptions()),
+    )  # fmt: skip
+    monkeypatch.setattr(incremental_mapper, "run_mapper", mapper)
+    monkeypatch.setattr(mapping.global_mapper, "leaves_photographs_out", lambda _: False)
+    silence_colmap()
+    groups, console = [replace(GROUP, is_confirmed=confirmed)], Console(quiet=True)
+    monkeypatch.setattr(mapping.fisheyes, "candidates", lambda *_: [])
+    models, held = mapping.map_photographs(plan, Workspace(tmp_path), groups, "key", 6, console)
+    assert models[0].cameras[1].focal_length == pytest.approx((1.0 if confirmed else 1.14) * FOCAL)
+    assert mapper.made == ([True] if confirmed else [True, False])
+    assert not held[0]

@@ -29,6 +29,7 @@ from vdgs.sfm import feature_matching, incremental_mapper
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.image_metadata import EXACT_MODEL
 from vdgs.sfm.reprojection import mean_reprojection_error
+from vdgs.sfm.turning import only_turns
 from vdgs.sfm.workspace import Workspace, report_progress
 from vdgs.system.atomic_files import explain_disk_errors
 from vdgs.system.child_python import python_command
@@ -93,6 +94,8 @@ def _take(workspace: Workspace, parts: Sequence[pycolmap.Reconstruction]) -> str
         if image.num_points3D < MIN_POINTS:
             joined.deregister_frame(image.frame_id)
     why = _why_not(parts, joined)
+    if not why and only_turns(workspace, joined):
+        why = "a camera that only turns explains what they show, which tells no depth"
     if not why:
         shutil.rmtree(workspace.models)
         write_model_files(joined, workspace.models / "0")

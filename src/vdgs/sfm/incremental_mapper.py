@@ -22,7 +22,7 @@ from vdgs.sfm.capture_writer import is_impossible, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.flights import flights_of
 from vdgs.sfm.focal_information import focal_deviation
-from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
+from vdgs.sfm.focal_length import AGREE, CALIBRATED_SOURCE, alike
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, FISHEYE, ImageMetadata
 from vdgs.sfm.position_lines import is_nearly_collinear
@@ -54,11 +54,14 @@ OF_PARALLEL = "several heights, but views so parallel that the photographs canno
 #: Why a focal length is held or fitted: a person says so; it was held until `is_contradicted`; or fitted, `is_astray`.
 ASKED = "asked for"
 TAGS_DISAGREE = "what the photographs say of it contradicts itself"
-CONTRADICTED = "held at what one tag alone says of it, the photographs fit together plainly worse"
+CONTRADICTED = "one tag alone says it, and the photographs tell it better"
 CONFIRMED = "tags that agree say it, and the photographs cannot tell it: fitted, it went astray"
 #: A fitted focal length contradicts the held one where points lie nearer to where they are seen by this share (choice),
 #: and the two are no one value as tags go (`AGREE`). Over ground that does not tell it neither is so.
 CLEARLY_NEARER = 0.05
+#: So does one that is off by so much less where they lie nearer by so much, if it is off by so many of the standard
+#: deviations that photographs leave of it (choices).
+PLAINLY_NEARER, FAR_OFF, SIGMAS_OFF = 0.1, 0.05, 5.0
 #: Between these quantiles (5 % and 95 %) lie so many standard deviations of errors.
 ERRORS_RANGE = 3.29
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
@@ -220,7 +223,7 @@ def is_contradicted(
 ) -> bool:
     """Whether the focal length of a model was held at what one tag alone says, and the photographs plainly say another:
     programs that shrink photographs rewrite what tags count from."""
-    said = {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
+    said = focals_by_one_tag(groups)
     if not held[0] or held[1] in (ASKED, CONFIRMED) or not said:
         return False
     fitted = pycolmap.Reconstruction(model)
@@ -228,8 +231,30 @@ def is_contradicted(
     as_held = mean_reprojection_error(fitted)
     fit_focal(fitted, threads)
     nearer = 1 - mean_reprojection_error(fitted) / as_held
-    return nearer >= CLEARLY_NEARER and any(
-        not alike(fitted.cameras[k].mean_focal_length(), focal) for k, focal in said.items() if k in fitted.cameras
+    off = [abs(math.log(fitted.cameras[k].mean_focal_length() / f)) for k, f in said.items() if k in fitted.cameras]
+    if nearer < CLEARLY_NEARER or not off:
+        return False
+    is_told = nearer >= PLAINLY_NEARER and max(off) >= max(FAR_OFF, SIGMAS_OFF * focal_deviation(fitted))
+    return max(off) >= math.log(AGREE) or is_told
+
+
+def focals_by_one_tag(groups: Sequence[CameraGroup]) -> dict[int, float]:
+    """Focal lengths (pixels) that one tag alone says, by the numbers of the cameras."""
+    return {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
+
+
+def is_told_of_one_tag(
+    model: pycolmap.Reconstruction, meant: tuple[bool, str], held: tuple[bool, str], groups: Sequence[CameraGroup]
+) -> bool:
+    """Whether the photographs tell a focal length that was `meant` to be held at what one tag alone says. Points that a
+    wrong one made hold it where it was, however it is fitted: those that a camera shows which turns on the spot, to
+    which it gives a depth. Such a model is made anew."""
+    placed = {image.camera_id for image in placed_images(model)}
+    return (
+        meant[0]
+        and meant[1] != OF_LINE
+        and held == (False, OF_SHAPE)
+        and bool(focals_by_one_tag(groups).keys() & placed)
     )
 
 

@@ -267,7 +267,7 @@ def _steps(
         feature_matching.count_verified_matches(workspace),
         lost,
     )
-    check_enough_placed(models[0], left_out)
+    check_enough_placed(models[0], left_out, workspace)
     mapped = pycolmap.Reconstruction(models[0])
     found = georeference(models[0], plan, held)
     discard_training(plan.request.output, run)

@@ -42,7 +42,9 @@ from vdgs.sfm.preflight import (
 )
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import mean_reprojection_error
+from vdgs.sfm.turning import only_turns
 from vdgs.sfm.up_direction import model_points, tilt_from_attitudes
+from vdgs.sfm.workspace import Workspace
 from vdgs.system.lazy_pycolmap import pycolmap
 
 #: What nothing tells of a model without positions, attitudes and surveyed points.
@@ -54,6 +56,9 @@ THEN = "; then by "
 #: Cameras follow the relief where heights over what each sees spread by less than this share of those over the median
 #: point (choice).
 FOLLOWS = 0.5
+#: Points that a model needs, in all and in its median photograph. The mapper asks for a hundred of the first two and
+#: for thirty of each other one (choices).
+MIN_POINTS, MIN_POINTS_EACH = 50, 15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 MAX_TILT_DEG = 3.0
 
@@ -177,14 +182,36 @@ def exclusion_reasons(
     return found
 
 
-def check_enough_placed(model: pycolmap.Reconstruction, left_out: Sequence[ExcludedImage]) -> None:
-    """Raise CaptureError for a model of fewer photographs than a scene needs."""
-    placed = len(placed_images(model))
+def check_enough_placed(
+    model: pycolmap.Reconstruction, left_out: Sequence[ExcludedImage], workspace: Workspace
+) -> None:
+    """Raise CaptureError for a model of fewer photographs, or points, than a scene needs, and where photographs were
+    taken from one place: those that it places, or all that match where it shows hardly anything."""
+    placed, lines = len(placed_images(model)), format_list([each.line for each in left_out])
+    is_poor = placed < MIN_IMAGES or _shows_little(model)
+    if only_turns(workspace, None if is_poor else model):
+        raise CaptureError(
+            "the photographs were taken from one place: a camera that only turns explains what they show, so they tell "
+            "no depth and no scene can be made of them. Move the camera between photographs, by a tenth of the "
+            f"distance to what it sees or more, with 70 to 80 % overlap.{lines}"
+        )
     if placed < MIN_IMAGES:
         raise CaptureError(
             f"only {placed} photographs could be joined; a scene needs {MIN_IMAGES} at the very least. Let photographs "
-            f"overlap by 70 to 80 %, the camera moving between them.{format_list([each.line for each in left_out])}"
+            f"overlap by 70 to 80 %, the camera moving between them.{lines}"
         )
+    if is_poor:
+        raise CaptureError(
+            f"the {placed} photographs that could be joined show only {model.num_points3D()} points in common, too few "
+            "for a scene. They overlap too little, are blurred or show little to hold on to (water, snow, sky), or the "
+            f"camera hardly moved between them. Fly with 70 to 80 % overlap, the camera moving.{lines}"
+        )
+
+
+def _shows_little(model: pycolmap.Reconstruction) -> bool:
+    """Whether a model has hardly any points, in all or in its median photograph."""
+    each = [image.num_points3D for image in placed_images(model)]
+    return model.num_points3D() < MIN_POINTS or bool(np.median(each) < MIN_POINTS_EACH)
 
 
 def _altitudes(prepared: ReconstructionPlan, control: GcpList | None, placed: Georegistration) -> str:
