@@ -89,7 +89,8 @@ def note_inputs(run: RunFolder, request: RunRequest, capture: Capture, began_ns:
             content = before[3] if before[:3] == stamp and before[3] else _content(path, counted)
             is_new = stamp[2] > began_ns and not _lies_in(path, written_here)
             files[name] = [*(_UNKNOWN if is_new else stamp), content]
-        write_json(run.path / INPUTS_FILE, {"named": named, "folders": inputs.folders, "files": files})
+        if _recorded(run) != (inputs, files):
+            write_json(run.path / INPUTS_FILE, {"named": named, "folders": inputs.folders, "files": files})
     except (OSError, VdgsError):
         (run.path / INPUTS_FILE).unlink(missing_ok=True)
 
