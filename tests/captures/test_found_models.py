@@ -69,13 +69,39 @@ def test_a_capture_is_used_without_the_photographs_that_are_gone(tmp_path, scene
     capture = load_capture(root)
     assert len(capture.views) == 9
     (said,) = [warning for warning in capture.warnings if "are missing; the others are used" in warning]
-    assert said.startswith("3 of 12 images that have a camera are missing")
+    assert f"{root}" in said.split(": 3 of 12 images that have a camera are missing")[0]
     assert all(image.stem in said for image in images[1:4])
     for image in images[4:8]:
         image.unlink()
     with pytest.raises(CaptureError, match=r"7 of 12 images that have a camera are missing") as refused:
         load_capture(root)
     assert all(image.stem in str(refused.value) for image in images[1:8])
+
+
+@pytest.mark.parametrize("gone", [3, 8])
+def test_of_a_smaller_size_with_fewer_photographs_the_whole_one_is_named(tmp_path, scene, gone):
+    root, images = write_kind("colmap", tmp_path, scene)
+    shutil.copytree(root / "images", root / "images_4")
+    shutil.copytree(root / "images", root / "images_masks")
+    for image in images[:gone]:
+        (root / "images_4" / image.name).unlink()
+    said = f"{root / 'images'} has them: --images images uses all."
+    if gone == 3:
+        warnings = load_capture(root, CaptureOptions(images="images_4")).warnings
+        assert said in warnings
+        assert any(each.startswith(f"{root / 'images_4'}: 3 of 12 images") for each in warnings)
+    else:
+        with pytest.raises(CaptureError, match=re.escape(said)):
+            load_capture(root, CaptureOptions(images="images_4"))
+    images[0].unlink()  # no folder has all
+    assert "has them" not in " ".join(_said(root))
+
+
+def _said(root: Path) -> list[str]:
+    try:
+        return list(load_capture(root, CaptureOptions(images="images_4")).warnings)
+    except CaptureError as error:
+        return [str(error)]
 
 
 # --------------------------------------------------------------------------------------------- models below

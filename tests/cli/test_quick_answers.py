@@ -16,16 +16,15 @@ import pytest
 
 from support.commands import PATIENCE_SECONDS
 from support.small_pipeline import NativeRun, vdgs
-from vdgs.captures.reconstruction import read_digests
 from vdgs.cli.argument_parser import parse_words
 from vdgs.cli.main import COMMANDS, main, verb_arguments
-from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MergeConfig
-from vdgs.pipeline.finished_run import _input_times, nothing_to_do
+from vdgs.pipeline.finished_run import nothing_to_do
+from vdgs.report.status_cli import full_run_status
+from vdgs.runs.open_run import open_capture
 from vdgs.runs.run_folder import RunFolder
-from vdgs.sfm.source_images import SourceFile, SourceImages
-from vdgs.system.atomic_files import write_json
+from vdgs.runs.run_inputs import are_inputs_unchanged, note_inputs
 from vdgs.system.similar_paths import suggest_path
 
 pytestmark = pytest.mark.slow
@@ -117,9 +116,22 @@ def test_a_folder_that_is_no_run_is_answered_at_once(place):
         assert f"flight: {'holds nothing of a run' if verb == 'report' else 'is not a run folder'}" in errors, verb
 
 
+def request_of(run: Path, capture: Path) -> RunRequest:
+    """The command that made a run of a capture, without maps."""
+    own = RunFolder(run).settings()
+    return RunRequest(capture=capture, output=run, ortho=False, options=own.capture, **vars(own.method))
+
+
+def note(asked: RunRequest, began_ns: int | None = None) -> None:
+    """Record of what the run of a request is made, as the command does once it has read that."""
+    run = RunFolder(asked.output)
+    note_inputs(run, asked, open_capture(run), time.time_ns() if began_ns is None else began_ns)
+
+
 def test_a_finished_run_is_answered_at_once(native_small: NativeRun, tmp_path):
     run = shutil.copytree(native_small.whole, tmp_path / "run")
     vdgs("report", run)
+    note(request_of(run, native_small.capture))
     again = ("run", native_small.capture, "--output", run, "--no-ortho")
     answers = answers_of(tmp_path, again, ("status", run))
     assert answers[0][1].startswith(f"nothing to do: {run} is whole\n")
@@ -130,19 +142,11 @@ def test_a_finished_run_is_answered_at_once(native_small: NativeRun, tmp_path):
 
 def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeRun, tmp_path):
     run = shutil.copytree(native_small.whole, tmp_path / "run")
-    own = RunFolder(run).settings()
-    asked = RunRequest(capture=native_small.capture, output=run, ortho=False, options=own.capture, **vars(own.method))
+    own, asked = RunFolder(run).settings(), request_of(run, native_small.capture)
+    note(asked)
     assert nothing_to_do(asked, "") == ""  # without a report
     vdgs("report", run)
     assert nothing_to_do(asked, "").startswith("nothing to do")
-    bars = tmp_path / "bars.txt"
-    bars.touch()
-    os.utime(bars, ns=(0, 0))
-    options = replace(own.capture, scale_bar=bars)  # of photographs: the capture that was made of them has it already
-    of_photographs = replace(asked, capture=native_small.capture / "images", options=options)
-    RunFolder(run).config.write(own, "vdgs run DCIM")
-    assert nothing_to_do(of_photographs, "vdgs run DCIM").startswith("nothing to do")
-    assert nothing_to_do(of_photographs, "vdgs run OTHERS") == ""
     others = (
         replace(asked, visibility_bins=5),
         replace(asked, capture=tmp_path),
@@ -151,11 +155,17 @@ def test_a_run_is_looked_at_closely_where_anything_differs(native_small: NativeR
         replace(asked, output=tmp_path / "new"),
     )
     assert [nothing_to_do(other, "") for other in others] == [""] * len(others)
-    newer = tmp_path / "settings.yaml"
-    newer.touch()
-    assert nothing_to_do(asked, "", [newer]) == ""
-    os.utime(run / "capture.json", ns=(0, 0))  # older than the capture
-    assert nothing_to_do(asked, "") == ""
+    bars = tmp_path / "bars.txt"
+    bars.touch()
+    options = replace(own.capture, scale_bar=bars)  # of photographs: the capture that was made of them has it already
+    of_photographs = replace(asked, capture=native_small.capture / "images", options=options)
+    RunFolder(run).config.write(own, "vdgs run DCIM")
+    note(of_photographs)
+    assert nothing_to_do(of_photographs, "vdgs run DCIM").startswith("nothing to do")
+    assert nothing_to_do(of_photographs, "vdgs run OTHERS") == ""
+    for record in ("{}", '{"named": 1, "files": {}}', "no JSON"):  # nothing says of what the run was made
+        (run / "inputs.json").write_text(record)
+        assert nothing_to_do(of_photographs, "vdgs run DCIM") == ""
 
 
 @pytest.mark.parametrize(
@@ -193,6 +203,17 @@ def test_a_command_line_that_is_not_understood_is_a_usage_error(arguments, says,
     assert says in capsys.readouterr().err
 
 
+def test_ctrl_c_while_modules_are_imported_ends_quietly(monkeypatch, capsys):
+    def interrupted(*_args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vdgs.cli.main._run_command", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main(["status", "R"])
+    assert ended.value.code == 130
+    assert capsys.readouterr() == ("", "")
+
+
 def test_choices_are_taken_in_the_letters_of_other_programs():
     given = parse_words(verb_arguments()["sfm"], ["DCIM", "--output", "C", "--camera-model", "SIMPLE_RADIAL"])
     assert "simple-radial" in given.values.values()
@@ -205,141 +226,153 @@ def test_a_path_is_suggested_where_a_part_of_it_is_mistyped(tmp_path):
     assert suggest_path(tmp_path / "card" / "quite another") == ""
 
 
-def set_time(file: Path, seconds_from_now: int) -> None:
-    when = time.time_ns() + seconds_from_now * 10**9
-    os.utime(file, ns=(when, when))
+def put_older(file: Path, content: bytes) -> None:
+    """Another file in the place of one, of the same size, written long before the run, as `cp -p` and `rsync -t` put
+    it."""
+    file.write_bytes(content)
+    os.utime(file, ns=(10**18, 10**18))
+
+
+@pytest.fixture
+def whole(native_small: NativeRun, tmp_path: Path) -> RunRequest:
+    """A finished run of a capture of its own, of which nothing is recorded."""
+    capture = shutil.copytree(native_small.capture, tmp_path / "place")
+    run = RunFolder(shutil.copytree(native_small.whole, tmp_path / "run"))
+    run.move_capture(capture)
+    vdgs("report", run.path)
+    return request_of(run.path, capture)
+
+
+@pytest.mark.parametrize("what", ["photograph", "model", "mask", "added", "gone", "folder"])
+def test_what_changed_in_a_capture_is_seen_whatever_its_time(whole, what):
+    capture = whole.capture
+    (capture / "masks").mkdir()
+    photograph = min((capture / "images").iterdir())
+    mask = Path(shutil.copy(photograph, capture / "masks" / f"{photograph.stem}.png"))
+    note(whole)
+    assert nothing_to_do(whole, "").startswith("nothing to do")
+    shutil.copytree(capture, capture.with_name("copy"))
+    if what == "photograph":
+        put_older(photograph, photograph.read_bytes())
+    elif what == "model":
+        model = capture / "sparse" / "0" / "images.bin"
+        put_older(model, model.read_bytes())
+    elif what == "mask":
+        put_older(mask, mask.read_bytes())
+    elif what == "added":
+        put_older(capture / "masks" / "another.png", b"")
+    elif what == "gone":
+        mask.unlink()
+    else:  # an older folder in the place of the former one
+        capture.rename(capture.with_name("before"))
+        capture.with_name("copy").rename(capture)
+    assert nothing_to_do(whole, "") == ""
+
+
+def test_status_tells_what_changed_by_what_it_holds(whole):
+    """Of a capture: copies of the same files are no change, nor are files on which no result depends."""
+    run, capture = RunFolder(whole.output), whole.capture
+    photograph, table = min((capture / "images").iterdir()), capture / "positions.csv"
+    table.write_text("name,lat,lon,alt")
+    given = replace(whole, options=replace(whole.options, test_list=table))
+    note(given)
+    assert full_run_status(run).is_complete
+    for file in (photograph, table):
+        put_older(file, file.read_bytes())
+    (capture / "another.png").touch()
+    assert full_run_status(run).is_complete
+    put_older(table, b"name,lat,lon,ALT")
+    photograph.write_bytes(b"")
+    (capture / "masks").mkdir()
+    (capture / "masks" / "new.png").touch()
+    stage = full_run_status(run).stages[0]
+    assert (stage.name, stage.state) == ("capture", "stale")
+    assert f"changed since the run read its inputs: {photograph.name}, positions.csv" in stage.reason
+    assert "masks added since the run read its inputs: new.png" in stage.reason
+    capture.rename(capture.with_name("away"))  # as a card that was taken out
+    assert "capture" not in [each.name for each in full_run_status(run).stages]
+
+
+def test_what_changed_after_the_command_began_is_compared_again(whole):
+    note(whole, began_ns=0)
+    assert nothing_to_do(whole, "") == ""
+
+
+@pytest.mark.parametrize("option", ["gcp", "scale_bar", "gps"])
+def test_tables_that_place_photographs_are_inputs(whole, option):
+    """Of a run of photographs, whose settings do not hold them; also one of the same size and of an older time."""
+    run, table = RunFolder(whole.output), whole.capture / "table.txt"
+    photographs, command = whole.capture / "images", "vdgs run DCIM"
+    table.write_text("before")
+    if option == "gps":
+        asked = replace(whole, capture=photographs, options=replace(whole.options, gps=table))
+    else:
+        asked = replace(whole, capture=photographs, sfm=replace(whole.sfm, **{option: table}))
+    (photographs / "DJI_1.xmp").write_text("here")
+    run.config.write(run.settings(), command)
+    note(asked)
+    assert nothing_to_do(asked, command).startswith("nothing to do")
+    put_older(photographs / "DJI_1.xmp", b"far!")  # a sidecar
+    assert nothing_to_do(asked, command) == ""
+    note(asked)
+    assert nothing_to_do(asked, command).startswith("nothing to do")
+    put_older(table, b"after!")
+    assert nothing_to_do(asked, command) == ""
 
 
 @pytest.mark.parametrize("where", ["linked folder", "folder of a project"])
-def test_photographs_that_lie_elsewhere_are_looked_at_too(native_small: NativeRun, tmp_path, where):
-    run, card = shutil.copytree(native_small.whole, tmp_path / "run"), tmp_path / "card"
-    capture = shutil.copytree(native_small.capture, tmp_path / "capture")
-    RunFolder(run).move_capture(capture)
-    shutil.move(capture / "images", card)
-    if where == "linked folder":
-        (capture / "images").symlink_to(card)
-        (card / "around").symlink_to(tmp_path)
-    cameras = json.loads((run / "cameras.json").read_text())
+def test_photographs_that_lie_elsewhere_are_looked_at_too(whole, tmp_path, where):
+    card, run = tmp_path / "card", RunFolder(whole.output)
+    shutil.move(whole.capture / "images", card)
+    (whole.capture / "images").symlink_to(card)
+    (card / "around").symlink_to(tmp_path)
+    read = open_capture(run)
     if where == "folder of a project":
-        views = [view | {"file": str(card / Path(view["file"]).name)} for view in cameras["views"]]
-        cameras |= {"input_folders": [str(card)], "views": views}
-    write_json(run / "cameras.json", cameras)
-    own = RunFolder(run).settings()
-    asked = RunRequest(capture=capture, output=run, ortho=False, options=own.capture, **vars(own.method))
-    vdgs("report", run)
-    set_time(run / "capture.json", 100)
-    assert nothing_to_do(asked, "").startswith("nothing to do")
-    set_time(next(card.glob("*.png")), 200)
-    assert nothing_to_do(asked, "") == ""
+        (whole.capture / "images").unlink()
+        views = tuple(replace(view, image_path=card / view.image_path.name) for view in read.views)
+        read = replace(read, views=views, images=str(card))
+    note_inputs(run, whole, read, time.time_ns())
+    assert nothing_to_do(whole, "").startswith("nothing to do")
+    put_older(next(card.glob("*.png")), b"")
+    assert nothing_to_do(whole, "") == ""
 
 
-@pytest.mark.parametrize("capture_is", ["a project file", "the folder"])
-def test_a_run_beside_photographs_is_none_of_them(native_small: NativeRun, tmp_path, capture_is):
-    """Neither what stages write after capture.json, nor another run or a log beside it, is a change of the capture."""
+def test_a_run_beside_photographs_is_none_of_them(native_small: NativeRun, tmp_path):
+    """Neither what stages write, nor another run or a log beside it, is a change of the capture."""
     place = shutil.copytree(native_small.capture, tmp_path / "place")
-    project = place / "project.xml"
-    project.touch()
-    photographs = [shutil.copy(file, place) for file in (place / "images").iterdir()]
     run = shutil.copytree(native_small.whole, place / "run")
-    cameras = json.loads((run / "cameras.json").read_text())
-    write_json(run / "cameras.json", cameras | {"input_folders": ["."]})
-    capture = project if capture_is == "a project file" else place
-    RunFolder(run).move_capture(capture)
-    own = RunFolder(run).settings()
-    asked = RunRequest(capture=capture, output=run, ortho=False, options=own.capture, **vars(own.method))
-    for file in place.rglob("*"):
-        set_time(file, -200)
-    (run / "capture.json").touch()
+    RunFolder(run).move_capture(place)
+    asked = request_of(run, place)
+    note(asked)
     vdgs("report", run)
     shutil.copytree(run, place / "another run")
-    if capture_is == "a project file":
-        (place / "run.log").touch()
+    (place / "run.log").touch()
     assert nothing_to_do(asked, "").startswith("nothing to do")
-    time.sleep(0.05)
-    old = shutil.copy2(photographs[0], place / "added.png")  # with the time of the file that it is a copy of
+    photograph = min((place / "images").iterdir())
+    added = Path(shutil.copy2(photograph, place / "added.png"))  # with the time of the file that it is a copy of
     assert nothing_to_do(asked, "") == ""
-    Path(old).unlink()
+    added.unlink()
     assert nothing_to_do(asked, "").startswith("nothing to do")
-    Path(photographs[0]).rename(place / "renamed.png")
+    photograph.rename(place / "renamed.png")
     assert nothing_to_do(asked, "") == ""
 
 
-@pytest.mark.parametrize("run_is_of", ["photographs", "a capture"])
-def test_a_photograph_that_is_removed_beside_the_run_is_missed(native_small: NativeRun, tmp_path, run_is_of):
-    """The run lies among what it was made of, where the time of the folder tells nothing."""
-    place = shutil.copytree(native_small.capture, tmp_path / "DCIM")
-    photographs = [Path(shutil.copy(file, place)) for file in sorted((place / "images").iterdir())]
-    run = RunFolder(shutil.copytree(native_small.whole, place / "run"))
-    own, command = run.settings(), "vdgs run DCIM --output DCIM/run"
-    if run_is_of == "photographs":
-        digests = read_digests(run.own_capture)
-        gone = Path(shutil.copy(photographs[0], place / "of before.png"))
-        gone.write_bytes(b"another")
-        digests.of(gone)
-        gone.unlink()
-        files = tuple(SourceFile(file.name, digests.of(file)) for file in photographs)
-        SourceImages(folders=(str(place),), files=files, command=command).write(run.own_capture)
-        digests.write()
-        run.config.write(own, command)
-    else:
-        run.move_capture(place)
-        cameras = json.loads(run.cameras_file.read_text())
-        views = [view | {"file": Path(view["file"]).name} for view in cameras["views"]]
-        write_json(run.cameras_file, cameras | {"input_folders": ["."], "views": views})
-        own = run.settings()
-    asked = RunRequest(capture=place, output=run.path, ortho=False, options=own.capture, **vars(own.method))
-    for file in place.rglob("*"):
-        set_time(file, -200)
-    run.capture_file.touch()
-    vdgs("report", run.path)
-    assert nothing_to_do(asked, command).startswith("nothing to do")
-    photographs[0].unlink()
-    assert nothing_to_do(asked, command) == ""
+def test_what_is_read_beside_a_film_or_a_folder_is_an_input(whole, tmp_path):
+    film, table = tmp_path / "DJI_1.MP4", whole.capture / "geo.txt"
+    for asked, beside in ((film, tmp_path / "DJI_1.SRT"), (whole.capture / "images", table)):
+        film.touch()
+        beside.write_text("before")
+        request, run = replace(whole, capture=asked), RunFolder(whole.output)
+        note(request)
+        assert are_inputs_unchanged(run, request)
+        put_older(beside, b"after!")
+        assert not are_inputs_unchanged(run, request)
 
 
-def test_photographs_that_were_renamed_or_removed_before_the_capture_was_made_anew_are_not_missed(
-    native_small: NativeRun, tmp_path
-):
-    """Digests of their former names are kept; one of two copies that was used is missed all the same."""
-    place, command = tmp_path / "DCIM", "vdgs run DCIM --output DCIM/run"
-    shutil.copytree(native_small.capture / "images", place)
-    photographs = sorted(place.iterdir())
-    photographs.append(Path(shutil.copy(photographs[0], place / "copy.png")))
-    run = RunFolder(shutil.copytree(native_small.whole, place / "run"))
-    own = run.settings()
-    run.config.write(own, command)
-    asked = RunRequest(capture=place, output=run.path, ortho=False, options=own.capture, **vars(own.method))
-    vdgs("report", run.path)
-    set_time(run.capture_file, 100)
-
-    def make_anew():
-        digests = read_digests(run.own_capture)
-        files = tuple(SourceFile(file.name, digests.of(file), "") for file in photographs)
-        SourceImages(folders=(str(place),), files=files, command=command).write(run.own_capture)
-        digests.write()
-
-    make_anew()
-    assert nothing_to_do(asked, command).startswith("nothing to do")
-    photographs.pop().unlink()
-    assert nothing_to_do(asked, command) == ""
-    make_anew()
-    assert nothing_to_do(asked, command).startswith("nothing to do")
-    photographs.append(photographs.pop(0).rename(place / "renamed.png"))
-    assert nothing_to_do(asked, command) == ""
-    make_anew()
-    assert nothing_to_do(asked, command).startswith("nothing to do")
-
-
-def test_a_folder_that_an_option_names_is_looked_at_with_all_below(tmp_path):
-    place, mask = tmp_path / "place", tmp_path / "masks" / "below" / "new.png"
-    place.mkdir()
-    mask.parent.mkdir(parents=True)
-    mask.touch()
-    set_time(mask, 100)
-    request = RunRequest(
-        capture=place, output=tmp_path / "run", options=CaptureOptions(masks=str(tmp_path / "masks"))
-    )  # fmt: skip
-    assert max(_input_times(request, ())) == mask.stat().st_mtime_ns
+def test_a_run_that_was_moved_still_has_its_inputs(whole, tmp_path):
+    note(whole)
+    moved = whole.output.rename(tmp_path / "moved")
+    assert are_inputs_unchanged(RunFolder(moved), replace(whole, output=moved))
 
 
 def test_settings_that_the_coarse_stage_leaves_as_they_are_are_named(native_small: NativeRun, tmp_path, capsys):

@@ -51,6 +51,24 @@ def test_a_lens_that_follows_the_focus_and_a_zoom_of_few_photographs_are_one_cam
     assert len(group_by_camera(collect_images([tmp_path]).images)) == 1
 
 
+def with_serial(file: Path, serial: str) -> None:
+    with Image.open(file) as image:
+        exif, shown = image.getexif(), np.asarray(image)
+    exif.get_ifd(0x8769)[0xA431] = serial
+    picture(file, shown, exif=exif, quality=92)
+
+
+@pytest.mark.parametrize(("serials", "count"), [("abcdef", 1), ("aabbcc", 1), ("aaabbb", 2), ("aaaabb", 2)])
+def test_serial_numbers_of_one_or_two_photographs_each_are_no_cameras(tmp_path, serials, count):
+    for name, serial in zip(flight(tmp_path), serials, strict=True):
+        with_serial(tmp_path / name, serial)
+    found = collect_images([tmp_path])
+    assert len(group_by_camera(found.images)) == count
+    told = [note for note in found.notes if "serial numbers" in note]
+    assert len(told) == (count == 1)
+    assert all(f"6 photographs have {len(set(serials))} serial numbers" in note for note in told)
+
+
 @pytest.mark.parametrize("letters", ["XWDSA", "VNSWE"])
 @pytest.mark.parametrize("name", ["DSC{:05d}_{}.JPG", "{1}/DSC{0:05d}_{1}.JPG", "DJI_{:04d}_{}.JPG"])
 @pytest.mark.parametrize("size", [(160, 120), (130, 100)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 from dataclasses import replace
@@ -18,11 +19,13 @@ from vdgs.cli.main import main
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.method import MethodConfig
+from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import RunError, VdgsError
 from vdgs.report.status_cli import EXIT_INCOMPLETE, full_run_status, next_line, status_json
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.sfm import workspace
+from vdgs.sfm import reconstruct, workspace
+from vdgs.sfm.discarding import check_trained_on_this, run_of_capture
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.reconstruction_plan import check_output_folder
 from vdgs.sfm.run_request import make_sfm_request
@@ -30,6 +33,7 @@ from vdgs.sfm.source_images import SourceImages, check_unchanged, source_changes
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_json
 from vdgs.system.content_digests import ContentDigests, find_copies
+from vdgs.system.quoting import shell_line
 
 
 @pytest.fixture
@@ -119,6 +123,19 @@ def test_photographs_that_were_copied_or_touched_are_the_same(run, card, tmp_pat
         check_unchanged(run.own_capture, SourceImages.of([copied], read_digests(run.own_capture)), overwrite=False)
 
 
+def test_folders_in_another_order_are_told(card, tmp_path):
+    """Where folders have one name, numbers in their order tell their photographs apart."""
+    second = shutil.copytree(card, tmp_path / "second" / card.name)
+    (second / "DJI_3.jpg").write_bytes(b"another")
+    digests, output = ContentDigests(tmp_path / "digests.json"), tmp_path / "capture"
+    SourceImages.of([card, second], digests).write(output)
+    swapped = SourceImages.of([second, card], digests)
+    as_before = re.escape(shell_line([card, second]))
+    with pytest.raises(VdgsError, match=rf"in another order.*as before \({as_before}\)"):
+        check_unchanged(output, swapped, overwrite=False)
+    check_unchanged(output, swapped, overwrite=True)
+
+
 def test_what_cannot_be_read_says_nothing_of_changes(run, card):
     digests = read_digests(run.own_capture)
     before = SourceImages.read(run.own_capture)
@@ -189,7 +206,7 @@ def test_masks_that_are_others_than_before_are_named(tmp_path, beside):
     named = (
         "photographs: 2 with another mask, or without (1.png, 2.png)"
         if beside
-        else "photographs: 1 removed (masks/2.png), 1 changed (masks/1.png)"
+        else "photographs: 1 mask removed (masks/2.png), 1 mask changed (masks/1.png)"
     )
     assert source_changes(output) == named
     with pytest.raises(VdgsError, match="begun with other photographs"):
@@ -247,3 +264,35 @@ def test_training_on_another_capture_is_deleted(run):
     run.discard_training()
     assert not run.is_trained
     assert not run.coarse.has_output()
+
+
+def test_a_trained_capture_in_its_run_is_not_made_otherwise_without_a_word(run):
+    """By another command, such as `vdgs sfm --output RUN/capture`."""
+    capture, elsewhere = run.own_capture, run.path.parent / "elsewhere" / "capture"
+    assert run_of_capture(capture) is None  # no settings yet: the photographs come first
+    run.config_file.write_text("vdgs:\n")
+    assert run_of_capture(capture) == run
+    assert run_of_capture(elsewhere) is run_of_capture(run.path) is None
+    request = SfmRequest(image_folders=(), output=capture)
+    for folder in (capture, run.path):
+        (folder / RECONSTRUCTION_FILE).write_text("{}")
+    run.capture_file.touch()
+    check_trained_on_this(request, run)
+    (capture / RECONSTRUCTION_FILE).write_text('{"placed": "elsewhere"}')
+    with pytest.raises(RunError, match="placed anew since the run was trained"):
+        check_trained_on_this(request, run)
+    check_trained_on_this(replace(request, overwrite=True), run)
+    assert not run.is_trained
+    check_trained_on_this(request, run)
+
+
+def test_sfm_in_a_run_is_for_this_run(run, card, monkeypatch):
+    """So that it refuses to change what the run was trained on."""
+    asked = list[RunFolder | None]()
+    monkeypatch.setattr(reconstruct, "reconstruct", lambda _request, _console, of_run: asked.append(of_run))
+    run.config_file.write_text("vdgs:\n")
+    for output in (run.own_capture, run.path.parent / "another"):
+        with pytest.raises(SystemExit) as ended:
+            main(["sfm", str(card), "--output", str(output)])
+        assert ended.value.code == 0
+    assert asked == [run, None]

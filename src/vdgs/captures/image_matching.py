@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +49,7 @@ def match_images(
     paths = _image_paths(source, folder, available, warnings)
     there = [path.is_file() for path in paths]
     missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
-    several = several_places(missing, available.images)
+    several = [*several_places(missing, available.images), *_fuller_folders(root, folder, missing)]
     try:
         warnings += [*refuse_many_missing(missing, len(paths), folder, options.strict), *several]
     except CaptureError as error:
@@ -61,6 +62,16 @@ def match_images(
         shown = some_names(spare)
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
     return _fitted(root, source, paths, options, warnings), len(spare)
+
+
+def _fuller_folders(root: Path, folder: Path, missing: Sequence[str]) -> list[str]:
+    """What to give instead of a folder of images, some of which are missing, where another size of them has all."""
+    sizes = [each for each in root.glob("images*") if re.fullmatch(r"images(_\d+)?", each.name)] if missing else []
+    for other in sorted(each for each in sizes if each.is_dir() and each != folder):
+        there = ImageNameIndex(find_images(other))
+        if all(there.find(name) for name in missing):
+            return [f"{other} has them: --images {other.name} uses all."]
+    return []
 
 
 def _image_paths(source: SourceCapture, folder: Path, available: ImageNameIndex, warnings: list[str]) -> list[Path]:

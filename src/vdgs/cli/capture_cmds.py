@@ -21,6 +21,8 @@ from vdgs.system.quoting import shell_line
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from vdgs.runs.run_folder import RunFolder
+
 
 @dataclass(frozen=True)
 class InspectArguments:
@@ -115,6 +117,7 @@ def sfm_command(arguments: list[str]) -> None:
     args = parse_arguments(SfmArguments, arguments, "sfm")
     from vdgs.captures.format_dispatch import lacks_points
     from vdgs.captures.output_guard import is_capture
+    from vdgs.sfm.discarding import run_of_capture
     from vdgs.sfm.image_list import HOW_TO_MAKE_NEW_POSES
 
     request = SfmRequest(
@@ -132,24 +135,29 @@ def sfm_command(arguments: list[str]) -> None:
             f"--images {args.project_images}: is for projects, whose photographs lie elsewhere. Of photographs alone "
             "give their own folder, without --images."
         )
+    run = run_of_capture(args.output)
     if args.dry_run:
-        _print_sfm_plan(request, options, is_posed, console)
+        _print_sfm_plan(request, options, is_posed, console, run)
         return
     if is_posed:
         from vdgs.sfm.posed_capture import make_posed_capture
 
-        make_posed_capture(request, options, console)
+        make_posed_capture(request, options, console, run)
     else:
         from vdgs.sfm.reconstruct import reconstruct
 
-        reconstruct(request, console)
+        reconstruct(request, console, run)
     capture = args.output.resolve()
-    run = shell_line(["vdgs", "run", capture, "--output", f"{capture}-run", "--preset", "laptop"])
-    console.print(escape(f"capture: {args.output}\nnext: {run}"), highlight=False)
+    words = [f"{capture}-run", "--preset", "laptop"] if run is None else [run.path]
+    after = shell_line(["vdgs", "run", capture, "--output", *words])
+    console.print(escape(f"capture: {args.output}\nnext: {after}"), highlight=False)
 
 
-def _print_sfm_plan(request: SfmRequest, options: CaptureOptions, is_posed: bool, console: Console) -> None:
-    """Say what `vdgs sfm` would do, of photographs alone or with poses (`is_posed`)."""
+def _print_sfm_plan(
+    request: SfmRequest, options: CaptureOptions, is_posed: bool, console: Console, run: RunFolder | None
+) -> None:
+    """Say what `vdgs sfm` would do, of photographs alone or with poses (`is_posed`), where it makes the capture of a
+    `run`."""
     if is_posed:
         from vdgs.sfm.posed_plan import plan_posed_capture, print_posed_plan
 
@@ -161,7 +169,7 @@ def _print_sfm_plan(request: SfmRequest, options: CaptureOptions, is_posed: bool
         from vdgs.sfm.sfm_estimate import estimate_sfm
 
         with temporary_frames(request, console) as with_frames:
-            plan, left = look_at_work(with_frames, None)
+            plan, left = look_at_work(with_frames, run)
             if said := describe_work_left(request, left):
                 console.print(escape(said), highlight=False)
             print_plan(plan, estimate_sfm(plan).text(plan.threads) if left == "all" else "", console)

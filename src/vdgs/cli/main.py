@@ -57,6 +57,13 @@ RESUMABLE_COMMANDS = ("run", "sfm", "train-coarse", "train-blocks", "lod", "orth
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vdgs`. Exit codes: 0 done, 1 an error that the message explains, 2 usage, 130 stopped; 3 from
     `vdgs status`, of a run that is not whole."""
+    try:
+        _answer(arguments)
+    except KeyboardInterrupt:  # while modules were imported, before a verb began
+        sys.exit(130)
+
+
+def _answer(arguments: Sequence[str] | None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "--help-all", "help"):
         sys.exit(exit_code_of("vdgs", lambda: print(HELP, end="") or (0 if arguments else 2), ""))

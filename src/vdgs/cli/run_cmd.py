@@ -115,7 +115,7 @@ def run_command(arguments: list[str]) -> None:
     console, command = make_console(args.quiet and not args.dry_run), given.command_line("run", NOT_KEPT)
     from vdgs.pipeline.finished_run import nothing_to_do
 
-    if done := nothing_to_do(args, command, [args.config] if args.config else []):
+    if done := nothing_to_do(args, command):
         console.print(done, markup=False, highlight=False)
         return
     if start.reason:

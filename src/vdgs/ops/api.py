@@ -28,7 +28,7 @@ from vdgs.config.ranges import MAX_COUNT, Range
 from vdgs.config.type_hints import field_hints
 from vdgs.config.typed_paths import home_path
 from vdgs.config.validation_rules import checked_settings, checked_value
-from vdgs.errors import VdgsError, check_kind
+from vdgs.errors import RunError, VdgsError, check_kind
 from vdgs.geometry.camera import Camera as Camera
 from vdgs.geometry.camera import check_camera, check_cameras
 from vdgs.kernels.device_selection import select_device
@@ -39,7 +39,7 @@ from vdgs.ops.scenes import open_run as open_run
 from vdgs.partition.assignment.assign_cameras import Assignment
 from vdgs.partition.blocks import Blocks
 from vdgs.runs import open_run as runs
-from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_folder import REMEDY_OF_OTHER_SETTINGS, RunFolder
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.system.stop_signals import stops_as_python
 
@@ -339,8 +339,12 @@ def train(
     if callbacks or isinstance(capture, Capture):
         given = "callbacks" if callbacks else "Capture"
         raise VdgsError(f"run_dir={str(run_dir)!r} takes no {given}: processes of their own read the capture's folder")
-    with without_autocast(where), stops_as_python():
-        train_in_run_folder(home_path(capture), settings, method, home_path(run_dir), _warning_console(), where)
+    try:
+        with without_autocast(where), stops_as_python():
+            train_in_run_folder(home_path(capture), settings, method, home_path(run_dir), _warning_console(), where)
+    except RunError as error:  # of the command line, which has --overwrite
+        remedy = "Give the old settings to continue, delete the folder to train anew, or name another run_dir."
+        raise RunError(str(error).replace(REMEDY_OF_OTHER_SETTINGS, remedy)) from error
     return open_run(run_dir, model="coarse" if isinstance(method, TrainConfig) else "best", device=where).scene
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import Literal, cast
 
@@ -35,6 +36,7 @@ from vdgs.report.write_report import write_report
 from vdgs.runs.create_or_resume import exclusive_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_inputs import note_inputs
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.run_request import (
     is_image_input,
@@ -64,12 +66,14 @@ def run_pipeline(request: RunRequest, console: Console, command: str | None = No
     check_weights_file(request.lpips_weights)
     check_output(request.output)
     RunFolder(request.output).check_output_empty()
+    given, began_ns = request, time.time_ns()
     choice = choose_image_size(reconstruct_if_needed(request, console, command), console)
     request = choice.request
     with exclusive_run(
         request.capture, request.output, request.options, request.method(), overwrite=request.overwrite,
         command=command, capture=choice.capture,
     ) as context:  # fmt: skip
+        note_inputs(context.run, given, context.capture, began_ns)
         _stages(context, request, console)
     console.print(escape(next_line(full_run_status(context.run))), highlight=False)
 

@@ -15,6 +15,7 @@ from vdgs.errors import VdgsError
 from vdgs.report.report_status import report_status
 from vdgs.runs.lod_status import lod_status
 from vdgs.runs.run_folder import PLACE_FILE, REPORT_FILE, RunFolder
+from vdgs.runs.run_inputs import input_changes
 from vdgs.runs.run_status import RunStatus, StageState, StageStatus, get_run_status
 from vdgs.runs.stage_folder import StatusRecord
 from vdgs.sfm.source_images import SourceImages, source_changes
@@ -27,6 +28,8 @@ from vdgs.system.units import rough_duration
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
 EXIT_INCOMPLETE = 3
+#: What a capture is called where it is not made of photographs by the run, and changed.
+CAPTURE_STAGE = "capture"
 STATE_STYLES = {
     "done": "green", "running": "cyan", "queued": "dim", "stopped": "yellow", "failed": "red", "stale": "yellow",
     "missing": "dim", "unknown": "yellow",
@@ -39,7 +42,9 @@ def full_run_status(run: RunFolder) -> RunStatus:
     if not run.config_file.exists() and photographs is None:
         run.settings()  # which says that there is none
     status = get_run_status(run)
-    if photographs is not None and not run.config_file.exists():  # it is written once there is a capture
+    if photographs is None:
+        photographs = _capture_status(run)
+    elif not run.config_file.exists():  # it is written once there is a capture
         status = replace(status, problem="", command=photographs.command)
     before = () if photographs is None else (photographs,)
     return replace(status, stages=(*before, *status.stages, *lod_status(run, status), report_status(run, status)))
@@ -52,7 +57,8 @@ def _photographs_status(run: RunFolder) -> StageStatus | None:
     if sources is None or (run.config_file.exists() and not _is_capture_of(run, root)):
         return None
     alone = shell_line(["vdgs", "sfm", *sources.folders, "--output", str(root.resolve())])
-    command, changes = sources.command or alone, source_changes(root)
+    command = sources.command or alone
+    changes = "; ".join(filter(None, (source_changes(root), input_changes(run, of_photographs=True))))
     stage = StageStatus(name=SFM_STAGE, state="done", folder=root.name, command=command)
     if not is_finished(root):
         step = read_step(root / WORK_FOLDER / PROGRESS_FILE)
@@ -61,6 +67,15 @@ def _photographs_status(run: RunFolder) -> StageStatus | None:
     if changes and stage.state != "running":
         stage = replace(stage, state="stale", reason=changes, command=f"{command} --overwrite")
     return stage
+
+
+def _capture_status(run: RunFolder) -> StageStatus | None:
+    """That the capture of a run, or a table that its command names, changed since; None where nothing did. The command
+    that began the run says more, and goes on where no result depends on it."""
+    changes = input_changes(run, of_photographs=False)
+    if not changes:
+        return None
+    return StageStatus(name=CAPTURE_STAGE, state="stale", folder=".", reason=changes)
 
 
 def _is_capture_of(run: RunFolder, root: Path) -> bool:

@@ -28,6 +28,11 @@ MOTION_FILE, MOTION_EXAMPLES = "coarse/motion/motion.json", "coarse/motion/examp
 
 #: The page about a run (`vdgs report`) and the facts of its place, in its folder.
 REPORT_FILE, PLACE_FILE = "report.html", "place.json"
+#: What to do where other settings make trained work useless.
+REMEDY_OF_OTHER_SETTINGS = (
+    "Add --overwrite to train that again, give the old settings to continue, or begin another run: vdgs run CAPTURE "
+    "--output RUN"
+)
 #: The folders of runs that this process drives.
 _driven = set[Path]()
 
@@ -151,9 +156,7 @@ class RunFolder:
             raise RunError(
                 f"{self.config_file}: other settings than this run has:\n  "
                 + "\n  ".join(changed)
-                + f"\nThey make {' and '.join(lost)} useless. Add --overwrite to train that again (vdgs.train has "
-                "none: delete the folder), give the old settings to continue, or begin another run: vdgs run CAPTURE "
-                "--output RUN (another run_dir)"
+                + f"\nThey make {' and '.join(lost)} useless. {REMEDY_OF_OTHER_SETTINGS}"
             )
         self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vdgs.captures.reconstruction import ANEW
+from vdgs.captures.reconstruction import ANEW, OWN_CAPTURE, RECONSTRUCTION_FILE
+from vdgs.captures.strays import is_run
 from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import RunError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.sfm.source_images import SourceImages
 from vdgs.sfm.workspace import Workspace
+
+
+def run_of_capture(output: Path) -> RunFolder | None:
+    """The run in whose folder a capture lies that is made of photographs (RUN/capture); None for captures elsewhere."""
+    folder = output.resolve()
+    return RunFolder(output.parent) if folder.name == OWN_CAPTURE and is_run(folder.parent) else None
 
 
 def agree_to_discard(output: Path, key: str, run: RunFolder | None) -> None:
@@ -46,3 +53,20 @@ def check_nothing_trained(request: SfmRequest, run: RunFolder | None, key: str |
             "--gps), and the run was trained on it. Add --overwrite to do both again, give the old settings to "
             "continue, or take another --output."
         )
+
+
+def check_trained_on_this(request: SfmRequest, run: RunFolder | None) -> None:
+    """Raise RunError where a run was trained on its capture as that was before it was made anew or placed anew by
+    another command; with --overwrite, delete what was trained instead. For a finished capture of these photographs."""
+    if run is None or not run.is_trained:
+        return
+    now, then = (folder / RECONSTRUCTION_FILE for folder in (request.output, run.path))
+    if not then.is_file() or now.read_bytes() == then.read_bytes():
+        return
+    if not request.overwrite:
+        raise RunError(
+            f"{run.path}: its capture was made or placed anew since the run was trained on it. Add --overwrite to "
+            "train on it as it is now, or take another --output."
+        )
+    with run.drive_lock():
+        run.discard_training()

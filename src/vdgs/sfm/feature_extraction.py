@@ -121,7 +121,9 @@ def write_upright_images(
     of those of other kinds.
 
     Returns those that could not be decoded, in the order of their files. Photographs themselves are never changed.
+    CaptureError where the disk does not tell their names apart.
     """
+    _check_names(workspace, photographs)
     of_file: dict[Path, list[ImageMetadata]] = {}
     for photo in sorted(photographs, key=lambda photo: str(photo.path)):
         of_file.setdefault(photo.path, []).append(photo)
@@ -142,6 +144,19 @@ def _is_decoded(photo: ImageMetadata) -> bool:
     """Whether a photograph is decoded to be prepared; others are linked, or copied as they are."""
     is_jpeg = photo.path.suffix.lower() in _JPEGS
     return bool(photo.kind or photo.face or photo.orientation != 1 or not is_jpeg)
+
+
+def _check_names(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> None:
+    """Raise CaptureError for names that differ in upper and lower case alone, where the disk takes these for one."""
+    alike: dict[str, list[str]] = {}
+    for photo in photographs:
+        alike.setdefault(photo.name.lower(), []).append(photo.name)
+    twins = next((names for names in alike.values() if len(names) > 1), None)
+    if twins and workspace.path.is_dir() and (workspace.path.parent / workspace.path.name.swapcase()).is_dir():
+        raise CaptureError(
+            f"{workspace.path.parent}: this disk takes {twins[0]} and {twins[1]} for one file. Rename one of these "
+            "photographs, or take an output on another disk."
+        )
 
 
 def _prepare(workspace: Workspace, photographs: Sequence[ImageMetadata]) -> list[ExcludedImage]:

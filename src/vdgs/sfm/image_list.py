@@ -36,6 +36,7 @@ from vdgs.sfm.image_metadata import ImageMetadata, UnusableImage, is_twice_as_wi
 from vdgs.sfm.mask_files import check_mask, find_masks
 from vdgs.sfm.photograph_versions import taken_apart
 from vdgs.sfm.rig_folders import with_sensors
+from vdgs.sfm.serial_numbers import without_odd_serials
 from vdgs.sfm.sidecars import list_folder, with_sidecars
 from vdgs.sfm.used_bands import unused_bands
 from vdgs.system.content_digests import find_copies
@@ -159,6 +160,7 @@ class _Chosen(NamedTuple):
 
 def _chosen(photographs: list[ImageMetadata], camera_model: CameraModel, brackets: Brackets) -> _Chosen:
     photographs, doubled = _drop_duplicates(photographs)
+    photographs, odd_serials = without_odd_serials(photographs)
     unused, spectral = unused_bands(photographs)
     photographs, strange = _of_the_flight([photo for photo in photographs if photo.name not in unused])
     exposures, bracketed = unused_exposures(photographs) if brackets == "middle" else ({}, [])
@@ -166,7 +168,7 @@ def _chosen(photographs: list[ImageMetadata], camera_model: CameraModel, bracket
     photographs, lone = _with_models([photo for photo in photographs if photo.name not in exposures], camera_model)
     photographs, rigs = with_sensors(photographs)
     left_out = [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
-    return _Chosen(photographs, left_out, [*spectral, *bracketed, *rigs])
+    return _Chosen(photographs, left_out, [*odd_serials, *spectral, *bracketed, *rigs])
 
 
 def _too_few(folders: Sequence[Path], count: int, left_out: Sequence[str]) -> CaptureError:
@@ -285,8 +287,8 @@ def _read(
 
 
 def _drop_duplicates(photographs: list[ImageMetadata]) -> tuple[list[ImageMetadata], list[ExcludedImage]]:
-    """Leave out copies of the same file, the same photograph with another ending, and names that differ in upper and
-    lower case only. Of copies that one stays whose name and folders do not say that it is one, else the shallower."""
+    """Leave out copies of the same file, and the same photograph with another ending or in other letters (upper and
+    lower case). Of copies that one stays whose name and folders do not say that it is one, else the shallower."""
     kept, left_out = list[ImageMetadata](), list[ExcludedImage]()
     groups = find_copies([photo.path for photo in photographs])
     group_of = {photographs[k].name: number for number, group in enumerate(groups) for k in group}
@@ -315,11 +317,10 @@ def _by_originality(name: str) -> tuple[bool, int, str]:
 
 def _why_same(photo: ImageMetadata, other: ImageMetadata) -> str:
     """Why a photograph does not count beside another whose name differs in its ending and case alone; empty where both
-    were taken, at other moments or places, and their names can be told apart."""
-    if photo.name.lower() == other.name.lower():
-        return (
-            f"has the name of {other.name} but for upper and lower case, which many disks do not tell apart: rename "
-            "one of the two to use both"
-        )
+    were taken, at other moments or places, and their masks can be told apart."""
     one_mask = photo.mask is not None and photo.mask == other.mask  # which of the two is it of?
-    return "" if taken_apart(photo, other) and not one_mask else f"has the name of {other.name} with another ending"
+    if taken_apart(photo, other) and not one_mask:
+        return ""
+    if photo.name.lower() == other.name.lower():
+        return f"has the name of {other.name} but for upper and lower case: rename one of the two to use both"
+    return f"has the name of {other.name} with another ending"

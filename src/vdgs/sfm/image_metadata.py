@@ -164,6 +164,8 @@ EXACT_MODEL = "SIMPLE_PINHOLE"
 _OVER_TAKE_OFF = ("RelativeAltitude", "sensefly:Height", "drone-yuneec:AboveHomeAltitude", "FLIR:MAVRelativeAltitude")
 #: What cameras are called that do not say what they are.
 UNKNOWN_CAMERA = "unknown camera"
+#: What stands before the serial number in the name of a camera.
+SERIAL = " no. "
 
 
 class UnusableImage(Exception):
@@ -423,7 +425,7 @@ def _camera(tags: Mapping[int, Any], details: Mapping[int, Any], xmp: Mapping[st
     maker, model = plain_text(tags.get(0x010F)), plain_text(tags.get(0x0110))
     serial = plain_text(details.get(0xA431)) or text(xmp, "CameraSerialNumber")
     named = model if maker and model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
-    return f"{named or UNKNOWN_CAMERA}{f' no. {serial}' if serial else ''}"
+    return f"{named or UNKNOWN_CAMERA}{f'{SERIAL}{serial}' if serial else ''}"
 
 
 def _subsecond(details: Mapping[int, Any]) -> float | None:

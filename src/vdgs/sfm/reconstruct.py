@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,7 +36,13 @@ from vdgs.sfm import (
     mask_files,
 )
 from vdgs.sfm.console_report import print_reconstruction_report
-from vdgs.sfm.discarding import agree_to_discard, check_nothing_trained, discard_training, forget_agreement
+from vdgs.sfm.discarding import (
+    agree_to_discard,
+    check_nothing_trained,
+    check_trained_on_this,
+    discard_training,
+    forget_agreement,
+)
 from vdgs.sfm.films.take_frames import with_frames
 from vdgs.sfm.georeferencing import Georeferenced, georeference
 from vdgs.sfm.image_list import ExcludedImage
@@ -94,9 +101,12 @@ def reconstruct(
     prepared, digests = plan_reconstruction(request), read_digests(output)
     work, keys = Workspace(output / WORK_FOLDER), step_keys(prepared, digests)
     sources = SourceImages.of(request.image_folders, digests, command)
+    if command is None and run is not None and (begun := SourceImages.read(output)) is not None:
+        sources = replace(sources, command=begun.command)  # that of the run, which goes on with it
     left = _work_left(prepared, keys, sources, run)
     before = None if left == "all" else read_reconstruction(output)
     if before is not None and left == "nothing":
+        check_trained_on_this(request, run)
         console.print(describe_work_left(request, left), highlight=False)
         with suppress(VdgsError):  # they save reading and advice, and the folder may be read-only
             if SourceImages.read(output) != sources:  # of files that are not used, or the command

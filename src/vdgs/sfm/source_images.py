@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from vdgs.captures.reconstruction import SOURCE_IMAGES_FILE, read_digests
+from vdgs.captures.strays import is_mask_folder, masked_stem
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.system.content_digests import ContentDigests
+from vdgs.system.quoting import shell_line
 from vdgs.system.records import record_from_dict, record_to_dict
 from vdgs.system.units import first_names
 
@@ -64,18 +66,29 @@ class SourceImages:
         write_json(output / SOURCE_IMAGES_FILE, record_to_dict(self))
 
     def changes_since(self, before: SourceImages) -> str:
-        """2 photographs added (a.jpg, b.jpg), 1 removed (c.jpg), 1 with another mask (d.jpg); empty where nothing
-        changed."""
+        """photographs: 1 added (a.jpg), 2 masks removed (masks/b.png, masks/c.png), 1 with another mask (d.jpg); empty
+        where nothing changed."""
         old, new = ({each.name: each for each in files} for files in (before.files, self.files))
         both = [(old[name], new[name]) for name in old.keys() & new.keys()]
         changed = [now.name for was, now in both if was.digest and now.digest and was.digest != now.digest]
         masked = [now.name for was, now in both if None not in (was.mask, now.mask) and was.mask != now.mask]
-        kinds = (
-            ("added", new.keys() - old.keys()), ("removed", old.keys() - new.keys()), ("changed", changed),
-            ("with another mask, or without", masked),
-        )  # fmt: skip
-        parts = [f"{len(names)} {kind} ({first_names(sorted(names))})" for kind, names in kinds if names]
+        kinds = {"added": new.keys() - old.keys(), "removed": old.keys() - new.keys(), "changed": set(changed)}
+        parts = list[str]()
+        for kind, names in kinds.items():
+            masks = {name for name in names if _is_mask(name)}
+            parts += _told(names - masks, kind) + _told(masks, f"mask{'s' if len(masks) > 1 else ''} {kind}")
+        parts += _told(set(masked), "with another mask, or without")
         return f"photographs: {', '.join(parts)}" if parts else ""
+
+
+def _told(names: set[str], kind: str) -> list[str]:
+    return [f"{len(names)} {kind} ({first_names(sorted(names))})"] if names else []
+
+
+def _is_mask(name: str) -> bool:
+    """Whether a file of a folder of photographs is a mask, by its name."""
+    path = PurePosixPath(name)
+    return any(is_mask_folder(folder.name) for folder in path.parents) or masked_stem(path.stem) is not None
 
 
 def source_changes(output: Path) -> str:
@@ -98,7 +111,15 @@ def source_changes(output: Path) -> str:
 def check_unchanged(output: Path, now: SourceImages, overwrite: bool) -> None:
     """Raise VdgsError, naming them, where photographs are others than those a capture was begun with."""
     before = SourceImages.read(output)
-    if before is not None and not overwrite and (changes := now.changes_since(before)):
+    if before is None or overwrite:
+        return
+    if changes := now.changes_since(before):
+        if now.folders != before.folders and sorted(now.folders) == sorted(before.folders):
+            raise VdgsError(
+                f"{output}: was begun with these folders in another order, by which their photographs are named. Give "
+                f"them as before ({shell_line(before.folders)}), or add --overwrite to make it anew, with all that was "
+                "trained on it."
+            )
         raise VdgsError(
             f"{output}: was begun with other photographs than there are now. {changes[0].upper()}{changes[1:]}. Add "
             "--overwrite to make it anew of those that are there, with all that was trained on it; or restore them."

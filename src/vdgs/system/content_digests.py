@@ -49,7 +49,7 @@ class ContentDigests:
             stamp = [status.st_size, status.st_mtime_ns]
             known = self._known.get(name)
             if known is None or known[:2] != stamp:
-                known = [*stamp, _digest(path)]
+                known = [*stamp, file_digest(path)]
                 self._known[name], self._is_new = known, True
             return str(known[2])
         except OSError:
@@ -72,7 +72,7 @@ def find_copies(files: Sequence[Path]) -> list[list[int]]:
     """The numbers of files that are the same byte for byte, each with its copies. Whole files are read only where
     length and both ends agree. Raises OSError where one cannot be read, and what asked to stop."""
     groups = [list(range(len(files)))]
-    for part in (lambda path: path.stat().st_size, _ends, _digest):
+    for part in (lambda path: path.stat().st_size, _ends, file_digest):
         alike: dict[tuple[int, object], list[int]] = defaultdict(list)
         for number, group in enumerate(groups):
             for index in group:
@@ -89,8 +89,8 @@ def _ends(path: Path) -> bytes:
         return first + file.read()
 
 
-def _digest(path: Path) -> str:
-    """Of the content of a file. Raises OSError where it cannot be read, and what asked to stop."""
+def file_digest(path: Path) -> str:
+    """The digest of the content of a file. Raises OSError where it cannot be read, and what asked to stop."""
     digest = blake2b(digest_size=16)
     with path.open("rb") as file:
         while part := file.read(_PART_BYTES):

@@ -160,7 +160,7 @@ def refuse_many_missing(missing: Sequence[str], count: int, where: Path, strict:
         )
     more = len(missing) - MAX_MISSING_LISTED
     shown = ", ".join(missing[:MAX_MISSING_LISTED]) + (f", ... and {more} more" if more > 0 else "")
-    return [f"{len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
+    return [f"{where}: {len(missing)} of {count} images that have a camera are missing; the others are used ({shown})."]
 
 
 def refuse_lost_tests(lost: Sequence[str], count: int, where: Path, root: Path, options: CaptureOptions) -> list[str]:
