@@ -61,6 +61,8 @@ def lens_of(common: dict, frame: dict | None = None) -> Intrinsics:
         ({"camera_model": "OPENCV"}, PINHOLE),  # as converters write it of phones
         ({"k": RADTAN}, OPENCV),
         ({"k": [-0.2]}, ONE),
+        ({"k": 3}, PINHOLE),
+        ({"k": 16}, PINHOLE),
         ({"K": [50.0, 51.0, 32.0, 24.0]}, PINHOLE),
         ({"K": [[50.0, 0, 32.0], [0, 51.0, 24.0], [0, 0, 1]], "k": -0.2}, ONE),
         ({"dist": [-0.2]}, ONE),
@@ -119,7 +121,7 @@ def test_parameters_in_the_order_of_colmap_are_a_whole_lens(says):
         ({"fisheye": True}, "'fisheye' cannot be read"),
         ({"camera_model": "SIMPLE_RADIAL"}, "SIMPLE_RADIAL bends, and no key is known"),
         ({"lens": {"model": "RADIAL_FISHEYE"}}, "RADIAL_FISHEYE bends, and no key is known"),
-        ({"k": 800.0}, "'k' may be coefficients, or focal lengths"),
+        ({"k": 800.5}, "'k' may be coefficients, or focal lengths"),
         ({"K": [0.8, 0.8, 0.5, 0.5]}, "'K' may be coefficients, or focal lengths"),
         ({"k": [0.1, 0.2, 0.3]}, "'k' cannot be read: 3 numbers"),
         ({"camera_model": "SIMPLE_RADIAL", "params": [50.0, 32.0, 24.0, 0.1, 0.2]}, "5 parameters .* has 4"),

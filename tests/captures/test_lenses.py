@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vdgs.captures import pinholes
 from vdgs.captures.formats.brown_lens import (
     _bent,
     _slopes,
@@ -242,3 +243,16 @@ def test_colmap_models_know_no_such_lens(tmp_path: Path):
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n\n")
     with pytest.raises(CaptureError, match="BROWN"):
         read_colmap(tmp_path)
+
+
+def test_pinholes_of_a_capture_with_a_lens_for_each_photograph_are_found_once(monkeypatch):
+    """Notes, files and masks go through all lenses one after the other."""
+    found = []
+    lenses = [Intrinsics("RADIAL", (900.0 + k / 10, 500.0, 400.0, -0.01, 0.0), 1000, 800) for k in range(2000)]
+    monkeypatch.setattr(pinholes, "_colmap_pinhole", lambda lens: found.append(lens) or lens)
+    monkeypatch.setattr(pinholes, "is_valid_ray", lambda _lens, rays: [True] * len(rays))
+    monkeypatch.setattr(pinholes, "_valid_share", lambda _lens: 1.0)
+    assert pinholes.fold_notes(lenses) == []
+    assert [pinholes.undistorted_pinhole(lens) for lens in lenses] == lenses
+    assert len(found) == len(lenses)
+    pinholes._pinhole_and_shown.cache_clear()  # they are none

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from vdgs.captures.formats.brown_lens import MAX_ANGLE, MAX_SCALE, brown_pinhole
-from vdgs.captures.formats.lens_projection import colmap_camera, fold_radius, is_valid_ray, ray_pixels
+from vdgs.captures.formats.lens_projection import KEPT_LENSES, colmap_camera, fold_radius, is_valid_ray, ray_pixels
 from vdgs.captures.formats.source_capture import OWN_LENSES, Intrinsics
 from vdgs.errors import CaptureError
 
@@ -62,7 +62,7 @@ def folds_to_nothing(intrinsics: Intrinsics) -> bool:
     return False
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=KEPT_LENSES)
 def _pinhole_and_shown(lens: Intrinsics) -> tuple[Intrinsics, float | None]:
     """The pinhole camera, and which share of a photograph it shows if the lens is not valid in all of that."""
     whole = brown_pinhole(lens) if lens.model in OWN_LENSES else _colmap_pinhole(lens)

@@ -49,7 +49,7 @@ def read_rows(file: Path) -> tuple[str, list[Row], tuple[float | None, float | N
     else:
         parted = rows_of(lines, _LARGEST)
         rows = [row if len(row.words) > 5 else blanks for row, blanks in zip(parted, rows, strict=True)]
-    if not rows or any(map(_is_number, rows[0].words[:5])):
+    if not rows or any(math.isfinite(number_of(word)) for word in rows[0].words[:5]):  # 489,334.12, too: a mark
         return header.text, rows, (None, None, None)
     _check_order(rows[0], file)
     x, y, z = (rows[0].words + 3 * [""])[:3]

@@ -251,9 +251,11 @@ def _read_key(
 
 
 def _is_of_something_else(key: str, numbers: list[float] | None, is_list: bool) -> bool:
-    """Whether a key that may be of a lens says something else: near and far distances, the angle kappa of a pose, how
-    many coefficients there are, or more of them than a lens has."""
+    """Whether a key that may be of a lens says something else: near and far distances, the angle kappa of a pose, a
+    count or the number of a frame, how many coefficients there are, or more of them than a lens has."""
     name, numbers = _plain(key), numbers or []
+    if name == "k" and not is_list and numbers and numbers[0].is_integer() and numbers[0]:
+        return True  # no lens has a whole number for k1
     if name == _DISTANCES:
         small = is_list and 0 < max(numbers, default=0.0) < 1
         return len(numbers) < 4 and all(each >= 0 for each in numbers) and not small

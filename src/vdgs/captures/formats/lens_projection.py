@@ -16,6 +16,9 @@ from vdgs.captures.formats.source_capture import OWN_LENSES, Intrinsics
 _DIRECTIONS, _ANGLES, _ANGLES_BEYOND, _WIDEST_DEG = 32, 96, 32, 89.0
 #: Steps of its finite differences in radians, and how often it halves the angle between two of those in the end.
 _STEP, _HALVINGS = 1e-5, 30
+#: Of so many lenses what was found is kept, a few hundred bytes for each: captures may have one for each photograph,
+#: and go through all of them several times.
+KEPT_LENSES = 2**15
 
 
 def pixel_rays(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
@@ -44,7 +47,7 @@ def is_valid_ray(intrinsics: Intrinsics, rays: np.ndarray) -> np.ndarray:
     return np.hypot(*rays.T) <= fold_radius(intrinsics)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=KEPT_LENSES)
 def fold_radius(intrinsics: Intrinsics) -> float:
     """The length of x/z, y/z up to which a lens shows each ray at a place of its own; infinite where that holds for all
     rays ahead of it.
