@@ -257,6 +257,13 @@ def test_shapes_that_do_not_belong_together_are_refused(change):
         )
 
 
+def test_more_offsets_than_can_be_numbered_are_refused():
+    scene = Scene.random(1, k=32)
+    many = [each.expand(2**26, *each.shape[1:]) for each in scene.arguments[:4]]
+    with pytest.raises(ValueError, match=r"at most 2.31 - 1 offsets"), torch.no_grad():
+        decode(*many, scene.weights, turned())
+
+
 def test_rows_of_another_type_are_refused():
     scene = Scene.random(4, 4)
     with pytest.raises(TypeError, match="rows must be int64"), torch.no_grad():
@@ -365,6 +372,20 @@ class TestMoving:
         assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
         for one, other in zip(whole[3], pieces[3], strict=True):
             torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * float(one.abs().max()))
+
+    def test_what_autograd_has_saved_of_the_anchors_is_no_longer_good(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        read = []
+
+        def watched(positions, states, weights, camera, rows, gradients, updates):
+            moved = [updates, *(tensor for state in states for tensor in state[:3])]
+            before = [tensor._version for tensor in moved]
+            answer = moving(positions, states, weights, camera, rows, gradients, updates)
+            read.extend(tensor._version > old for tensor, old in zip(moved, before, strict=True))
+            return answer
+
+        moved_by(watched, scene, turned(), rows)
+        assert read == 10 * [True]
 
     def test_a_frozen_decoder_costs_nothing(self, moving):
         scene, rows = Scene.random(20, 4), torch.arange(20)

@@ -234,6 +234,26 @@ class TestMeaning:
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
             raster.image.sum().backward()
 
+    @pytest.mark.parametrize("changed", range(5))
+    def test_splats_that_were_changed_have_no_way_back(self, changed, library):
+        """The way back reads them too."""
+        scene = SCENES["ordinary"].to(torch.float32)
+        raster = drawn(scene, library)
+        with torch.no_grad():
+            scene.tensors[changed].mul_(0.5)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            raster.image.sum().backward()
+
+    def test_room_for_gradients_of_another_shape_is_refused(self, library):
+        scene = SCENES["ordinary"]
+        program = CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        splats, background = splats_of([each.detach() for each in scene.tensors])
+        size, m = (scene.width, scene.height), len(splats.depths)
+        _, pullback = rasterize_vjp(splats, background, *size, program=program)
+        for shapes in (((m, 1), (m, 3)), ((m, 2), (m - 1, 3))):
+            with pytest.raises(ValueError, match="do not fit"):
+                pullback(torch.ones(*size[::-1], 3), out=tuple(torch.zeros(shape) for shape in shapes))
+
     @pytest.mark.parametrize("name", ["image", "alpha", "depth"])
     def test_gradients_of_another_picture_are_refused(self, name, library):
         program = CudaProgram(name="rasterize.cu", driver=HostDriver(library), headers=PROGRAM.headers)

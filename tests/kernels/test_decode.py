@@ -256,6 +256,13 @@ def test_shapes_that_do_not_belong_together_are_refused():
             native_decode(*wrong.arguments, CAMERAS[0])
 
 
+def test_more_offsets_than_can_be_numbered_are_refused():
+    scene = Scene.random(1, k=32)
+    many = [each.expand(2**26, *each.shape[1:]) for each in scene.arguments[:4]]
+    with pytest.raises(ValueError, match=r"at most 2.31 - 1 offsets"), torch.no_grad():
+        native_decode(*many, scene.weights, CAMERAS[0])
+
+
 @EVERY_ISA
 def test_activations_are_exact_to_a_few_units_in_the_last_place(isa, monkeypatch):
     monkeypatch.setattr(extension, "get_extension", lambda: extension.load_extension(isa))

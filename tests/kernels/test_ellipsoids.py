@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -66,6 +68,16 @@ def test_what_is_not_cut_into_runs_is_refused_and_nothing_has_no_mean(kernels):
             kernels.mean_ellipsoids(log_scales, quaternions, weights, torch.tensor(starts))
     none = kernels.mean_ellipsoids(log_scales[:0], quaternions[:0], weights[:0], torch.zeros(0, dtype=torch.int64))
     assert [tuple(each.shape) for each in none] == [(0, 3), (0, 4)]
+
+
+@BOTH
+@pytest.mark.parametrize("short", [0, 1])
+def test_scales_and_axes_of_fewer_pairs_are_refused(kernels, short):
+    """The kernel does not look again: it would read beyond the end."""
+    arguments = list(seen([2, 3]))
+    arguments[short] = arguments[short][:2]
+    with pytest.raises(ValueError, match=r"must be .5"):
+        inspect.unwrap(kernels.mean_ellipsoids)(*arguments)
 
 
 def test_threads_change_no_bit():

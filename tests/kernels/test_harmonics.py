@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -136,6 +138,21 @@ def test_rows_and_coefficients_that_do_not_fit_are_refused(kernels):
             kernels.harmonic_colors(means, torch.zeros(4, 12), torch.tensor([row]), eye, 1)
     with pytest.raises(ValueError, match="degree 2 has 27 coefficients, not 12"):
         kernels.harmonic_colors(means, torch.zeros(4, 12), torch.tensor([0]), eye, 2)
+
+
+@BOTH
+def test_pairs_and_places_that_are_too_few_are_refused(kernels):
+    """The kernel does not look again: it would read beyond the end."""
+    fit, show = inspect.unwrap(kernels.fit_harmonics), inspect.unwrap(kernels.harmonic_colors)
+    directions, colors, weights, starts = seen([3, 2])
+    for few in ((directions[:2], colors), (directions, colors[:2])):
+        with pytest.raises(ValueError, match=r"must be .5, 3"):
+            fit(*few, weights, starts, 1, RIDGE_WEIGHT)
+    coefficients, rows = torch.zeros(4, 12), torch.tensor([0, 3])
+    with pytest.raises(ValueError, match=r"means must be .2, 3"):
+        show(torch.zeros(1, 3), coefficients, rows, torch.ones(3), 1)
+    with pytest.raises(ValueError, match=r"eye must be .3"):
+        show(torch.zeros(2, 3), coefficients, rows, torch.ones(1), 1)
 
 
 def test_any_number_of_threads_gives_the_same_bits():

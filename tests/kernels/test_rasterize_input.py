@@ -17,6 +17,7 @@ from support.rasterize_scenes import (
     make_scene,
     splats_of,
 )
+from vdgs.kernels.autograd import check_splats
 from vdgs.kernels.cpu.extension import load_extension, supported_isas
 from vdgs.kernels.cpu.rasterize import rasterize, rasterize_vjp
 from vdgs.kernels.kernel_types import Splats
@@ -179,3 +180,16 @@ def test_impossible_pictures_are_refused(width: int, height: int) -> None:
     tensors = [t.detach() for t in make_scene(3, 10, 10).tensors]
     with pytest.raises(ValueError, match="must be from 1 to"):
         rasterize(*splats_of(tensors), width, height)
+
+
+def test_more_splats_than_can_be_numbered_are_refused() -> None:
+    tensors = tuple(torch.zeros(1, *tail).expand(2**31, *tail) for tail in ((2,), (3,), (3,), (), ()))
+    with pytest.raises(ValueError, match=r"at most 2.31 - 1 splats"):
+        check_splats((*tensors, torch.zeros(3)), 10, 10)
+
+
+@pytest.mark.parametrize("room", [((9, 1), (9, 3)), ((9, 2), (9, 2)), ((8, 2), (9, 3)), ((9, 2), (8, 3))])
+def test_room_for_gradients_of_another_shape_is_refused(room) -> None:
+    _, pullback = rasterize_vjp(*splats_of([each.detach() for each in make_scene(9, 10, 10).tensors]), 10, 10)
+    with pytest.raises(ValueError, match="gradients of 9 splats of 9 do not fit"):
+        pullback(torch.ones(10, 10, 3), out=tuple(torch.zeros(shape) for shape in room))

@@ -1,5 +1,7 @@
 """Growth's statistics: the native sums equal the twin's, for any number of threads."""
 
+import inspect
+
 import pytest
 import torch
 
@@ -69,3 +71,20 @@ def test_a_mask_that_does_not_fit_is_refused(room):
                 8,
             )
     assert float(sums[3].sum()) == 0
+
+
+@pytest.mark.parametrize("room", [native, reference])
+@pytest.mark.parametrize("short", ["opacities", "gradient_px", "drawn", "opacity", "seen"])
+def test_what_belongs_to_fewer_splats_or_anchors_is_refused(room, short):
+    """The kernel does not look again: it would read or write beyond the end."""
+    sums = DensificationStats.zeros(4, 3)
+    if short in sums.tensors():
+        object.__setattr__(sums, short, getattr(sums, short)[:2])  # without the run-time types of the tests
+    given = {"opacities": torch.ones(3), "gradient_px": torch.ones(3, 2)}
+    given = {name: tensor[:2] if name == short else tensor for name, tensor in given.items()}
+    with pytest.raises(ValueError, match=f"{short} must be"):
+        inspect.unwrap(room.add_view_statistics)(
+            sums, torch.tensor([1, 3]), torch.ones(2, dtype=torch.bool), torch.tensor([0, 1, 5], dtype=torch.int32),
+            **given, width=8, height=8,
+        )  # fmt: skip
+    assert not any(bool(each.any()) for each in sums.tensors().values())

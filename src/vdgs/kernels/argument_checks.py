@@ -25,6 +25,12 @@ def check_anchor_shapes(positions: Tensor, features: Tensor, offsets: Tensor, lo
     )
 
 
+def check_offset_count(anchors: int, k: int) -> None:
+    """Raise ValueError where so many visible anchors of k offsets are more than splats can be numbered."""
+    if anchors * k >= 2**31:
+        raise ValueError(f"at most 2^31 - 1 offsets can be decoded at once, not those of {anchors} anchors, {k} each")
+
+
 def check_splat_gradients(g: SplatGradients) -> None:
     """Raise ValueError unless there is a row for each splat."""
     check_row_shapes(

@@ -14,6 +14,8 @@ from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, S
 
 #: The largest picture side: tiles are numbered with 16 bits.
 MAX_IMAGE_SIDE_PX = 16 * 32767
+#: Splats are numbered with 31 bits.
+MAX_SPLATS = 2**31 - 1
 
 
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
@@ -117,6 +119,8 @@ def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_ty
         if not 1 <= side <= MAX_IMAGE_SIDE_PX:
             raise ValueError(f"{name} must be from 1 to {MAX_IMAGE_SIDE_PX} pixels, not {side}")
     n = len(tensors[0]) if tensors[0].dim() else 0
+    if n > MAX_SPLATS:
+        raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {n}")
     shapes = ((n, 2), (n, 3), (n, 3), (n,), (n,), (3,))
     names = ("means_px", "conics", "colors", "opacities", "depths", "background")
     for name, tensor, shape in zip(names, tensors, shapes, strict=True):
@@ -125,6 +129,14 @@ def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_ty
             raise TypeError(f"{name} must be float32{where}, not {tensor.dtype} on {tensor.device}")
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+
+
+def check_splat_outputs(splats: int, count: int, means: Tensor, conics: Tensor) -> None:
+    """Raise ValueError unless gradients of the first `count` of so many splats fit into these two tensors."""
+    if not 0 <= count <= splats or means.shape != (count, 2) or conics.shape != (count, 3):
+        raise ValueError(
+            f"gradients of {count} splats of {splats} do not fit into {list(means.shape)} and {list(conics.shape)}"
+        )
 
 
 def check_picture_gradients(

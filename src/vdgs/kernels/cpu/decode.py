@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.argument_checks import check_anchor_shapes
+from vdgs.kernels.argument_checks import check_anchor_shapes, check_offset_count
 from vdgs.kernels.autograd import once_differentiable
 from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.arguments import contiguous, packed_camera
@@ -30,9 +30,11 @@ def decode(
 
     Backward computes hidden layers again, and only the gradients that are needed; same bits for any number of threads.
     `rows` ascend without repetition; anchors are gathered only if autograd follows. Raises ValueError for shapes that
-    do not match or k > 32, IndexError for a row outside the anchors, RuntimeError for second derivatives.
+    do not match, k > 32 or 2^31 offsets in view, IndexError for a row outside the anchors, RuntimeError for second
+    derivatives.
     """
     check_anchors(positions, features, offsets, log_scales)
+    check_offset_count(len(positions if rows is None else rows), offsets.shape[1])
     tensors: tuple[Tensor, ...] = (positions.detach(), features, offsets, log_scales)
     if rows is not None:
         check_indices(rows, len(positions))

@@ -9,7 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.autograd import Drawn, check_picture_gradients, check_splats, rasterize_with_autograd
+from vdgs.kernels.autograd import (
+    Drawn,
+    check_picture_gradients,
+    check_splat_outputs,
+    check_splats,
+    rasterize_with_autograd,
+)
 from vdgs.kernels.cpu import extension as native_module
 from vdgs.kernels.cpu.arguments import check_outputs, new_floats
 from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, SplatContributions, Splats
@@ -64,8 +70,6 @@ def splat_contributions(
 def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any) -> tuple[Raster, _Pullback]:
     """The picture of means_px, conics, colors, opacities, depths before a background, and the way back."""
     check_splats(tensors, width, height, "cpu")
-    if len(tensors[0]) >= 2**31:
-        raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {len(tensors[0])}")
     module = module or native_module.get_extension()
     depths = (new_floats(height, width), new_floats(height, width)) if depth else (None, None)
     raster = Raster(new_floats(height, width, 3), new_floats(height, width), *depths)
@@ -99,8 +103,7 @@ class _Pullback:
         check_picture_gradients(*self.size, image, alpha, depth)
         n = self.count if count is None else count
         means, conics = out or (new_floats(n, 2), new_floats(n, 3))
-        if not 0 <= n <= self.count or not len(means) == len(conics) == n:
-            raise ValueError(f"gradients of {n} splats of {self.count} do not fit into {len(means)} and {len(conics)}")
+        check_splat_outputs(self.count, n, means, conics)
         check_outputs(means=means, conics=conics)
         colors, opacities, background = new_floats(n, 3), new_floats(n), new_floats(3)
         depths = new_floats(n) if self.with_depth else None

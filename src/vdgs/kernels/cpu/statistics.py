@@ -10,7 +10,7 @@ from vdgs.kernels.cpu import extension
 from vdgs.kernels.cpu.arguments import check_outputs
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.splat_segments import SplatMask, sources_tensor
-from vdgs.kernels.torch_ref.statistics import check_inside, check_sources
+from vdgs.kernels.torch_ref.statistics import check_inside, check_sources, check_sums_and_splats
 
 
 def add_view_statistics(
@@ -29,6 +29,7 @@ def add_view_statistics(
     sources = sources_tensor(source)
     check_sources(sources, visible, gradient.shape[1])
     check_inside(inside, visible)
+    check_sums_and_splats(statistics, len(sources), opacities, gradient_px)
     if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(gradient)):
         raise IndexError(f"a visible anchor lies outside the {len(gradient)} anchors")
     extension.get_extension().add_view_statistics(

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.geometry.camera import Camera
-from vdgs.kernels.argument_checks import check_anchor_shapes
+from vdgs.kernels.argument_checks import check_anchor_shapes, check_offset_count
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument, PackedCamera
 from vdgs.kernels.kernel_types import (
     FEATURE_SIZE,
@@ -74,7 +74,8 @@ def decode(
     """As `torch_ref.decode`, for float32 tensors on a CUDA device; `torch_ref` itself where autograd follows.
 
     Deterministic. Waits for the device once, for the number of splats, which are then sorted. Raises ValueError for
-    shapes that do not match or k > 32, TypeError for other dtypes, CudaUnavailable where the kernel cannot be run.
+    shapes that do not match, k > 32 or 2^31 offsets in view, TypeError for other dtypes, CudaUnavailable where the
+    kernel cannot be run.
     """
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
@@ -130,8 +131,9 @@ def _decoded(
     check_decoder(k, weights, anchors)
     if rows is not None:
         check_indices(rows, len(positions))
-    heads = [tensor for head in pack_decoder(weights, k) for tensor in head]
     count = len(positions) if rows is None else len(rows)
+    check_offset_count(count, k)
+    heads = [tensor for head in pack_decoder(weights, k) for tensor in head]
     blocks = -(-count // ANCHORS_PER_BLOCK)
     bits, begins, lengths = (positions.new_empty(n, dtype=torch.int32) for n in (count, blocks, blocks))
     sums = positions.new_empty(blocks)

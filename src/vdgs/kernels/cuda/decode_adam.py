@@ -72,6 +72,8 @@ def decode_backward_adam(
             torch._foreach_add_(sums, made.sums())
         elif made:
             sums = made.sums()
+    # What autograd has saved of these no longer holds their values.
+    torch.autograd.graph.increment_version([updates, *parts])
     finite = (broken == 0)[0]
     if wanted and not sums:  # nothing is visible
         return finite, tuple(torch.zeros_like(t) for t in weights.tensors())

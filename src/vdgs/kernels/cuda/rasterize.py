@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.autograd import Drawn, check_picture_gradients, check_splats, rasterize_with_autograd
+from vdgs.kernels.autograd import (
+    Drawn,
+    check_picture_gradients,
+    check_splat_outputs,
+    check_splats,
+    rasterize_with_autograd,
+)
 from vdgs.kernels.cuda.launch import CudaProgram, KernelArgument
 from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterGradients, RasterPullback, SplatContributions, Splats
 from vdgs.kernels.splat_segments import SplatSegments
@@ -35,7 +40,8 @@ def rasterize(
     """As `cpu.rasterize`, for float32 tensors on a CUDA device, median depth included. Deterministic.
 
     Waits for the device once, for the number of entries (splats times the tiles that they reach). Backward takes 52
-    bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where kernels cannot be run.
+    bytes an entry, and reads the splats again: RuntimeError where they or the image were changed in between. Raises
+    TypeError or ValueError for unsuitable tensors, CudaUnavailable where kernels cannot be run.
     """
     runs = _runs_of(splats)
     return rasterize_with_autograd(lambda t: _draw(t, runs, width, height, depth, program), splats, background)
@@ -96,11 +102,11 @@ def _draw(
         "rasterize_forward", grid, (THREADS,), *splats, entries.owners, entries.order, entries.bounds, background,
         ctypes.c_int(width), ctypes.c_int(height), image, transmittance, last, *depths,
     )  # fmt: skip
-    back = partial(
-        _Pullback, program=program, splats=splats, background=background, entries=entries,
-        transmittance=transmittance, last=last,
-    )  # fmt: skip
-    return Drawn(Raster(image, 1.0 - transmittance, *depths), (image, depths[0]), back)
+
+    def back(image: Tensor, depth: Tensor | None, *splats: Tensor) -> _Pullback:
+        return _Pullback(image, depth, program, list(splats), background, entries, transmittance, last)
+
+    return Drawn(Raster(image, 1.0 - transmittance, *depths), (image, depths[0], *splats), back)
 
 
 def _order(runs: SplatSegments, m: int, program: CudaProgram) -> Int32[Tensor, " m"]:
@@ -153,8 +159,10 @@ class _Pullback:
         entries, (height, width) = self.entries, self.transmittance.shape
         check_picture_gradients(height, width, image, alpha, depth)
         wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
-        first = slice(count)
-        kept = ctypes.c_longlong(len(means[first]))
+        n = len(means) if count is None else count
+        by_means, by_conics = out or (means.new_empty(n, 2), conics.new_empty(n, 3))
+        check_splat_outputs(len(means), n, by_means, by_conics)
+        kept = ctypes.c_longlong(n)
         sums = means.new_zeros(len(entries.owners), SUMS_PER_ENTRY)
         picture: list[KernelArgument] = [self.image, self.transmittance, self.last, self.depth]
         self.program.launch(
@@ -162,9 +170,8 @@ class _Pullback:
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
             *wanted, kept, sums,
         )  # fmt: skip
-        by_means, by_conics = out or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
-        by_colors, by_opacities = torch.empty_like(colors[first]), torch.empty_like(opacities[first])
-        by_depths = None if self.depth is None else torch.empty_like(depths[first])
+        by_colors, by_opacities = colors.new_empty(n, 3), opacities.new_empty(n)
+        by_depths = None if self.depth is None else depths.new_empty(n)
         self.program.launch(
             "gather_gradients", _over(len(means)), (THREADS,), *self.splats, entries.splats,
             ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colors, by_opacities,

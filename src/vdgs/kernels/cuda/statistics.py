@@ -12,7 +12,7 @@ from vdgs.kernels.cuda.decode import expand_sources
 from vdgs.kernels.cuda.launch import CudaProgram
 from vdgs.kernels.kernel_types import DensificationStats
 from vdgs.kernels.splat_segments import SplatMask
-from vdgs.kernels.torch_ref.statistics import check_inside, check_sources
+from vdgs.kernels.torch_ref.statistics import check_inside, check_sources, check_sums_and_splats
 
 #: Threads of a block: kThreads of the source.
 THREADS = 256
@@ -41,16 +41,13 @@ def add_view_statistics(
     sources = expand_sources(source)
     check_sources(sources, visible, k)
     check_inside(inside, visible)
+    check_sums_and_splats(statistics, len(sources), opacities, gradient_px)
     for name, tensor in (sums | {"opacities": opacities, "gradient_px": gradient_px}).items():
         if tensor.dtype != torch.float32:
             raise TypeError(f"{name} must be float32, not {tensor.dtype}")
     if sources.dtype != torch.int32:
         raise TypeError(f"source must be int32, not {sources.dtype}")
     m, v = len(sources), len(visible)
-    if opacities.shape != (m,) or gradient_px.shape != (m, 2):
-        raise ValueError(
-            f"opacities {list(opacities.shape)} and gradient_px {list(gradient_px.shape)} must be [{m}] and [{m}, 2]"
-        )
     program.launch(
         "add_view", (-(-max(m, v) // THREADS),), (THREADS,), visible.contiguous(), inside.contiguous(),
         ctypes.c_longlong(v), sources.contiguous(), opacities.detach().contiguous(), gradient_px.contiguous(),

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from vdgs.kernels.argument_checks import check_row_shapes
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.kernels.torch_ref.harmonics import check_starts
 
@@ -26,8 +27,9 @@ def mean_ellipsoids(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:  # fmt: skip
     """Logarithms of the scales and unit quaternions, wxyz, of the mean of each Gaussian, whose pairs begin at `starts`.
     The axes come in any order. Weights are positive. Raises ValueError unless each has a pair and the first begins with
-    the first pair."""
+    the first pair, and for shapes that do not match."""
     check_starts(starts, len(weights))
+    check_row_shapes(len(weights), log_scales=(log_scales, 3), quaternions=(quaternions, 4), weights=(weights,))
     if not len(starts):
         return log_scales.new_empty(0, 3), quaternions.new_empty(0, 4)
     counts = torch.diff(starts, append=starts.new_tensor([len(weights)]))

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from vdgs.kernels.argument_checks import check_row_shapes
 from vdgs.kernels.spherical_harmonics import eval_sh_bases, eval_sh_colors, num_sh_bases
 
 #: So many regressions are solved together, of about as many pairs each: their matrices stay in the cache.
@@ -28,9 +29,11 @@ def harmonic_colors(
     """RGB that the Gaussians of some `rows`, which lie at `means`, show to an `eye`: 1/2 + Σ c Y, not below 0.
 
     `coefficients` are those of all Gaussians, c = 3 f: RGB of the constant function first; their rows may stand apart.
-    Raises ValueError for another c, and where a row is none of theirs.
+    Raises ValueError for another c or shapes that do not match, IndexError where a row is none of theirs.
     """
     check_coefficients(coefficients, rows, degree)
+    check_row_shapes(len(rows), means=(means, 3))
+    check_row_shapes(3, eye=(eye,))
     chosen = coefficients[rows].unflatten(1, (-1, 3))
     directions = torch.nn.functional.normalize(means - eye, dim=1)
     return eval_sh_colors(chosen[:, 0], chosen[:, 1:], directions, degree)
@@ -41,8 +44,10 @@ def fit_harmonics(
     starts: Int64[Tensor, " m"], degree: int, ridge: float,
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
     """Coefficients of each Gaussian, whose pairs begin at `starts`. Directions are unit, from the camera; weights are
-    not negative. Raises ValueError unless each has a pair and the first begins with the first pair."""
+    not negative. Raises ValueError unless each has a pair and the first begins with the first pair, and for shapes that
+    do not match."""
     check_starts(starts, len(weights))
+    check_row_shapes(len(weights), directions=(directions, 3), colors=(colors, 3), weights=(weights,))
     functions = eval_sh_bases(directions, degree)
     f = functions.shape[1]
     known = torch.cat([functions, colors - 0.5], 1)

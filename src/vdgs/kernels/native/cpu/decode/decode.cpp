@@ -32,16 +32,18 @@ struct Piece {
 class Wave {
  public:
   Wave(int64_t pieces, int64_t capacity) {
-    const std::lock_guard<std::mutex> lock(mutex());
-    pieces_.swap(kept());
+    {
+      const std::unique_lock<std::mutex> lock(mutex(), std::try_to_lock);
+      if (lock) pieces_.swap(kept());
+    }
     while (static_cast<int64_t>(pieces_.size()) < pieces) pieces_.emplace_back();
     for (Piece& piece : pieces_)
       if (piece.capacity < capacity)
         piece = {std::unique_ptr<Splat[]>(new Splat[static_cast<size_t>(capacity)]), capacity, 0};
   }
   ~Wave() {
-    const std::lock_guard<std::mutex> lock(mutex());
-    if (kept().size() < pieces_.size()) kept().swap(pieces_);
+    const std::unique_lock<std::mutex> lock(mutex(), std::try_to_lock);
+    if (lock && kept().size() < pieces_.size()) kept().swap(pieces_);
   }
   Wave(const Wave&) = delete;
   Wave& operator=(const Wave&) = delete;
@@ -49,7 +51,8 @@ class Wave {
   Piece& operator[](int64_t i) { return pieces_[static_cast<size_t>(i)]; }
 
  private:
-  // Never destroyed: a thread may decode while the process ends.
+  // Never destroyed: a thread may decode while the process ends. Never waited for: in a forked child it stays locked
+  // where another thread of the parent held it, and pieces can be made anew.
   static std::mutex& mutex() {
     static auto* const mutex = new std::mutex;
     return *mutex;
