@@ -12,6 +12,7 @@ from PIL import Image
 from support.flights import write_photograph
 from support.small_flights import COUNT, flight, picture, pixels
 from vdgs.sfm.cut_pictures import cut_pictures
+from vdgs.sfm.edited_names import first_stems
 from vdgs.sfm.image_list import collect_images
 
 WHOLE = (160, 120)
@@ -125,6 +126,13 @@ def test_lenses_of_a_rig_with_other_sizes_are_no_cut_copies(tmp_path):
         for k in range(COUNT):
             write_photograph(tmp_path / folder / f"{k:04d}.JPG", pixels(k, *size), k, np.array([10.0 * k, 0, 40]))
     assert collect_images([tmp_path]).excluded == ()
+
+
+@pytest.mark.parametrize(
+    "behind", [" — kopia", "_–_Kopia_(2)", " — копия", " - Kopio", " - コピー", " - 副本", " - 복사본"]
+)
+def test_copies_are_told_as_systems_of_many_languages_name_them(behind):
+    assert first_stems(f"DJI_0003{behind}") == ["dji_0003"]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ EDITED_WORDS = "|".join(
     )
 )  # fmt: skip
 _COPY_NAME = re.compile(
-    r"(?P<first>.+?)(?:[ _-]+(?:copy|copie|kopie|copia|cópia|kopia|kopi|копия)(?:[ _]?\(?\d{1,2}\)?)?"
+    r"(?P<first>.+?)(?:[ _–—-]+(?:copy|copie|kopie|copia|cópia|kopia|kopi|kopio|kopya|kópia|másolat|копия|копія"
+    r"|αντιγραφή|コピー|副本|복사본)(?:[ _]?\(?\d{1,2}\)?)?"
     rf"|[-_~](?:{EDITED_WORDS}|edit|crop|cropped|hdr|enhanced(?:-(?:nr|sr|rd)){{0,3}})(?P<double>\(\d{{1,2}}\))?)",
     re.IGNORECASE,
 )
