@@ -128,6 +128,18 @@ def test_lenses_of_a_rig_with_other_sizes_are_no_cut_copies(tmp_path):
     assert collect_images([tmp_path]).excluded == ()
 
 
+@pytest.mark.parametrize("tagged", [True, False])
+def test_photographs_that_a_program_converted_beside_them_are_copies_and_no_masks(tmp_path, tagged):
+    names = flight(tmp_path)
+    for name in names:
+        with Image.open(tmp_path / name) as image:
+            exif = image.getexif() if tagged else Image.Exif()
+            image.point(lambda value: min(255, int(1.3 * value))).save(tmp_path / f"{name}.jpg", exif=exif, quality=60)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images if photo.mask is None] == names
+    assert len(found.excluded) == len(names) == len(found.images)
+
+
 @pytest.mark.parametrize(
     "behind", [" — kopia", "_–_Kopia_(2)", " — копия", " - Kopio", " - コピー", " - 副本", " - 복사본"]
 )

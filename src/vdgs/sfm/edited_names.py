@@ -32,6 +32,8 @@ _COPY_FOLDER = re.compile(
     r"|\(\d{1,2}\)$",
     re.IGNORECASE,
 )
+#: How programs that convert photographs name them where they keep the ending: DJI_0001.JPG.jpg.
+_CONVERTED = re.compile(r"(.+)\.(?:jpe?g|jpe|jfif|png|tiff?|dng|heic|heif|webp)", re.IGNORECASE)
 #: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
 _EDITED_ON_PHONE = re.compile(r"(.*\bIMG_)E(\d{4})", re.IGNORECASE)
 
@@ -42,6 +44,8 @@ def first_stems(stem: str) -> list[str]:
     stem = unicodedata.normalize("NFC", stem)
     if match := _EDITED_ON_PHONE.fullmatch(stem):
         return ["".join(match.groups()).lower()]
+    if match := _CONVERTED.fullmatch(stem):
+        return [match[1].lower()]
     if match := _COPY_OF.fullmatch(stem):
         return [match["first"].lower()]
     if match := _COPY_NAME.fullmatch(stem):
