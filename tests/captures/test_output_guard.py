@@ -232,7 +232,8 @@ def test_what_belongs_to_pictures_makes_their_folder_none_of_other_work(tmp_path
         for ending in beside:
             picture.with_name(picture.stem + ending).touch()
     (frames / "notes.txt").touch()
-    assert is_refused(frames / "film.mp4")
+    for name in ("film.mp4", "run", "runs/first"):
+        assert is_refused(frames / name), name
 
 
 @pytest.mark.parametrize("poses", ["transforms.json", "poses_bounds.npy"])

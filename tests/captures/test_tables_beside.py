@@ -168,6 +168,7 @@ def test_tables_between_the_given_folder_and_the_photographs_are_found(tmp_path)
     [
         ("gcp.txt", "GCP 1,436995.690,4572636.962,289.152,0.02,0.02", True),
         ("site GCPs.csv", "A1 436995 4572636 289", True),
+        ("Passpunkte.csv", "P1;384512,33;5814000,12;35,20;0,02;0,02", True),
         ("gcp.txt", "weather was fine that day", False),
         ("notes.txt", "GCP 1,436995.690,4572636.962,289.152", False),
     ],

@@ -12,6 +12,7 @@ from PIL import Image
 from support.flights import write_photograph
 from support.small_flights import COUNT, flight, picture, pixels
 from vdgs.sfm.cut_pictures import cut_pictures
+from vdgs.sfm.edited_names import first_stems
 from vdgs.sfm.image_list import collect_images
 
 WHOLE = (160, 120)
@@ -125,6 +126,25 @@ def test_lenses_of_a_rig_with_other_sizes_are_no_cut_copies(tmp_path):
         for k in range(COUNT):
             write_photograph(tmp_path / folder / f"{k:04d}.JPG", pixels(k, *size), k, np.array([10.0 * k, 0, 40]))
     assert collect_images([tmp_path]).excluded == ()
+
+
+@pytest.mark.parametrize("tagged", [True, False])
+def test_photographs_that_a_program_converted_beside_them_are_copies_and_no_masks(tmp_path, tagged):
+    names = flight(tmp_path)
+    for name in names:
+        with Image.open(tmp_path / name) as image:
+            exif = image.getexif() if tagged else Image.Exif()
+            image.point(lambda value: min(255, int(1.3 * value))).save(tmp_path / f"{name}.jpg", exif=exif, quality=60)
+    found = collect_images([tmp_path])
+    assert [photo.name for photo in found.images if photo.mask is None] == names
+    assert len(found.excluded) == len(names) == len(found.images)
+
+
+@pytest.mark.parametrize(
+    "behind", [" — kopia", "_–_Kopia_(2)", " — копия", " - Kopio", " - コピー", " - 副本", " - 복사본"]
+)
+def test_copies_are_told_as_systems_of_many_languages_name_them(behind):
+    assert first_stems(f"DJI_0003{behind}") == ["dji_0003"]
 
 
 @pytest.mark.parametrize(

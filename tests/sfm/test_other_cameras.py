@@ -176,6 +176,21 @@ def test_djis_thermal_pictures_are_left_out_across_folders_and_without_a_partner
     assert f"of the size of {folders[1]}{stems[0]}_T" in collect_images([tmp_path]).excluded[-1].reason
 
 
+def test_what_djis_first_cameras_of_three_lenses_call_by_words_is_told_as_what_letters_tell(tmp_path):
+    """The Zenmuse H20T of 2020: no source of the picture in its tags, one model for all."""
+    shoot(tmp_path, [f"DJI_{k:04d}_WIDE.JPG" for k in range(COUNT)])
+    shoot(tmp_path, [f"DJI_{k:04d}_ZOOM.JPG" for k in range(COUNT)], 20)
+    heat(shoot(tmp_path, [f"DJI_{k:04d}_THRM.JPG" for k in range(COUNT)], 50, (300, 210)))
+    shoot(tmp_path, [f"DJI_{k:04d}_SCRN.JPG" for k in range(COUNT)], 70, (320, 180))
+    found = collect_images([tmp_path])
+    assert {name.rpartition("_")[2] for name in used(found)} == {"WIDE.JPG", "ZOOM.JPG"}
+    assert (
+        "thermal picture beside DJI_0000_WIDE.JPG"
+        in {each.name: each.reason for each in found.excluded}["DJI_0000_THRM.JPG"]
+    )
+    assert len(found.images) == len(found.excluded) == 2 * COUNT
+
+
 @pytest.mark.parametrize(("focal_mm", "late_s"), [(20.0, 1), (8.5, 1), (20.0, 1800)])
 def test_pictures_of_the_size_of_a_thermal_sensor_need_a_longer_lens_and_a_photograph_of_their_moment(
     tmp_path, focal_mm, late_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -17,6 +18,8 @@ CLASSES = RANDOM.integers(0, 5, (24, 32, 1), np.uint8).repeat(3, 2) * 50
 VECTORS = RANDOM.normal(size=(24, 32, 3))
 NORMALS = np.round((VECTORS / np.linalg.norm(VECTORS, axis=2, keepdims=True) + 1) * 127.5).astype(np.uint8)
 NORMALS[:8] = 0
+GRAY = (DEPTH >> 6).astype(np.uint8)
+PALETTE = cv2.applyColorMap(GRAY, cv2.COLORMAP_INFERNO)[..., ::-1]
 
 
 def write(folder: Path, pictures: dict[str, np.ndarray], camera: str = "") -> None:
@@ -36,7 +39,10 @@ def write(folder: Path, pictures: dict[str, np.ndarray], camera: str = "") -> No
         ("frame-{}.color.png", "frame-{}.depth.png", DEPTH, "depth"),
         ("frame{}.jpg", "depth{}.png", DEPTH, "depth"),
         ("rgb_{}.png", "distance_to_image_plane_{}.tif", DEPTH, "depth"),
-        ("img_{}.png", "img_{}_disparity.png", (DEPTH >> 6).astype(np.uint8), "depth"),
+        ("img_{}.png", "img_{}_disparity.png", GRAY, "depth"),
+        ("{}.jpg", "{}_depth.png", GRAY[..., None].repeat(3, 2), "depth"),  # one value in three channels
+        ("DJI_{}.JPG", "DJI_{}_depth.jpg", GRAY[..., None].repeat(3, 2), "depth"),
+        ("{}.jpg", "{}_depth.png", PALETTE, "depth"),
         ("rgb_{}.png", "semantic_segmentation_{}.png", CLASSES, "classes"),
         ("DJI_{}.JPG", "DJI_{}.instance.png", CLASSES[..., 0], "classes"),
         ("{}.png", "{}_normal.png", NORMALS, "normals"),
@@ -64,6 +70,7 @@ def test_layers_beside_photographs_are_left_out(tmp_path, photograph, other, pix
         ({f"{name}_{k}.jpg": COLORS for k in range(4) for name in ("img", "seg")}, ""),
         ({f"img_{k}.png": COLORS for k in range(4)} | {f"depth_{k}.png": DEPTH for k in range(4)}, "depth"),
         ({f"{name}_{k}.png": DEPTH for k in range(4) for name in ("img", "depth")}, ""),
+        ({f"{name}_{k}.png": GRAY[..., None].repeat(3, 2) for k in range(4) for name in ("img", "depth")}, ""),
         ({f"img_{k}.png": COLORS for k in range(4)} | {f"adepth_{k}.png": DEPTH for k in range(4)}, ""),
     ],
 )

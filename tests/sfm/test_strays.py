@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,11 +18,12 @@ from support.raw_writer import write_dng
 from support.small_flights import COUNT, flight, half, picture, pixels, said
 from vdgs.captures import image_files
 from vdgs.captures.image_files import decode_image, decode_mask
-from vdgs.captures.strays import walk
+from vdgs.captures.strays import is_result, walk
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.cross_checks import strays
 from vdgs.sfm.feature_extraction import write_upright_images
+from vdgs.sfm.find_images import find_files
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images, is_image_folder
 from vdgs.sfm.image_metadata import read_image_metadata
@@ -113,6 +116,7 @@ def test_folders_of_systems_and_programs_are_not_read(tmp_path, folder, tagged):
         ("odm_orthophoto.tif", (300, 300)), ("site_orthomosaic.png", (160, 120)), ("dsm.tif", (160, 120)),
         ("plan_DSM.tif", (200, 200)), ("photographs.png", (300, 200)), ("contact sheet.jpg", (160, 120)),
         ("Screenshot 2026-06-01.png", (160, 120)), ("DJI_0001_thumb.JPG", (160, 120)),
+        ("Screenshot_20260601-120000.png", (160, 120)), ("Schermata 2026-06-01.png", (160, 120)),
         ("DJI_0001_preview.jpg", (160, 120)),
         ("anything.jpg", (300, 100)), ("logo.png", (200, 200)),
     ],
@@ -124,6 +128,22 @@ def test_pictures_that_are_none_of_the_flight_are_left_out_and_change_no_rule(tm
     assert [photo.name for photo in found.images] == names
     assert [each.name for each in found.excluded] == [name.replace(" ", "_")]
     assert should_fix_focal(found.images, read_gps_priors(found.images, None, (1, 2)), SfmOptions())[0]
+
+
+def test_pictures_of_the_screen_are_told_where_accents_are_letters_of_their_own():
+    assert is_result(Path(unicodedata.normalize("NFD", "Capture d\u2019\u00e9cran 2026-06-01.png")))
+    assert not is_result(Path("Screenshotel_0001.jpg"))
+
+
+def test_photographs_of_folders_of_one_name_stay_apart_whatever_else_is_called_like_them(tmp_path):
+    folders = [tmp_path / name for name in ("x/a", "y/a", "z/a_1", "z/A")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        picture(folder / "1.png", pixels(0, 64, 48))
+    found = find_files(folders).named
+    assert found == {
+        f"{name}/1.png": folder / "1.png" for name, folder in zip(("a_2", "a_3", "a_1", "A_4"), folders, strict=True)
+    }
 
 
 def test_maps_of_ours_among_photographs_are_left_out(tmp_path):

@@ -133,8 +133,8 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
     """Whether an output in a folder would lie among photographs.
 
     Where it is the folder, few pictures are enough. A file in the folder is refused for one of a camera, and for a
-    numbered series that is most of what is there; further up most of what is there must be pictures. Neither a home
-    folder with some pictures nor one of screenshots is a folder of photographs.
+    numbered series that is most of what is there; further up most of what is there must be pictures, or belong to a
+    series of them. Neither a home folder with some pictures nor one of screenshots is a folder of photographs.
     """
     try:
         names = {entry.name: entry.is_file() for entry in os.scandir(folder) if not entry.name.startswith(".")}
@@ -149,9 +149,10 @@ def _holds_photographs(folder: Path, output: Path) -> bool:
     pictures = [picture for picture in _without_undistorted(pictures, names) if not is_result(picture)]
     if output == folder:
         return len(pictures) >= _MANY_PICTURES or any(map(has_camera, pictures))
+    many, in_series = max(_MANY_PICTURES, len(names) / 2), _series_length(pictures, names)
     if _is_written_into(folder, output):
-        return _series_length(pictures, names) >= max(_MANY_PICTURES, len(names) / 2) or any(map(has_camera, pictures))
-    return len(pictures) >= max(_MANY_PICTURES, len(names) / 2)
+        return in_series >= many or any(map(has_camera, pictures))
+    return max(len(pictures), in_series) >= many
 
 
 def _series_length(pictures: Sequence[Path], names: Collection[str]) -> int:

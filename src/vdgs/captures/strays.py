@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
@@ -33,8 +34,10 @@ _MARKS = ("map.json", "render.json", "capture.json", "partition.json", "export.j
 _OF_MAPS = {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png"}
 #: Pictures of ours, and what screens leave on a disk.
 _PICTURES = re.compile(
-    r"(photographs|reconstruction|contact[_ -]?sheet)\.(png|jpe?g)|screen[ _-]?shots?\b.*|bildschirmfoto.*"
-    r"|capture d.écran.*"
+    r"(photographs|reconstruction|contact[_ -]?sheet)\.(png|jpe?g)|screen[ _-]?shots?(?![a-z]).*|bildschirmfoto.*"
+    r"|capture[ _-]d.[eé]cran.*|captura[ _-]de[ _-](pantalla|tela|ecrã).*|schermata.*|schermafbeelding.*"
+    r"|skärm(avbild|klipp).*|skærmbillede.*|skjermbilde.*|zrzut[ _-]ekranu.*|снимок[ _-]экрана.*|スクリーンショット.*"
+    r"|(屏幕|螢幕)?(截图|截圖|截屏|快照).*|스크린샷.*"
     r"|(odm_)?(orthophoto|orthomosaic|ortho|dsm|dtm|dem|hillshade|mosaic)([_-].*)?\.(tiff?|png|jpe?g)"
     r"|.+[_-](orthophoto|orthomosaic|transparent_mosaic[_-]?\w*|mosaic_\w+|dsm|dtm|ortho)\.(tiff?|png|jpe?g)",
     re.IGNORECASE,
@@ -86,7 +89,8 @@ def check_no_run(folder: Path) -> None:
 def is_result(file: Path) -> bool:
     """Whether a picture is by its name a map, an overview or a picture of a screen, not a photograph."""
     of_map = file.name.lower() in _OF_MAPS and (file.parent / "map.json").is_file()
-    return of_map or bool(_PICTURES.fullmatch(file.name))
+    name = unicodedata.normalize("NFC", file.name)  # systems write letters and their accents apart
+    return of_map or bool(_PICTURES.fullmatch(name))
 
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:

@@ -111,9 +111,14 @@ def control_point_notes(folders: Iterable[Path]) -> list[str]:
 def _has_points_alone(file: Path) -> bool:
     """Whether most lines of a file are a name and three numbers or more, and no photograph."""
     with suppress(CaptureError):
-        lines = [line.text for line in read_lines(file, "surveyed points") if line.text.strip()]
+        lines = [_with_points(line.text) for line in read_lines(file, "surveyed points") if line.text.strip()]
         return len(lines) > 2 and 2 * sum(bool(_POINT.match(line)) for line in lines) > len(lines)
     return False
+
+
+def _with_points(line: str) -> str:
+    """A line whose decimal sign is a point: where others part the columns, commas are those signs."""
+    return line.replace(",", ".") if re.search(r"[;\t]", line) else line
 
 
 def table_note(table: TableBeside, number: int) -> str:

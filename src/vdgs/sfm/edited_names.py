@@ -16,7 +16,8 @@ EDITED_WORDS = "|".join(
     )
 )  # fmt: skip
 _COPY_NAME = re.compile(
-    r"(?P<first>.+?)(?:[ _-]+(?:copy|copie|kopie|copia|cópia|kopia|kopi|копия)(?:[ _]?\(?\d{1,2}\)?)?"
+    r"(?P<first>.+?)(?:[ _–—-]+(?:copy|copie|kopie|copia|cópia|kopia|kopi|kopio|kopya|kópia|másolat|копия|копія"
+    r"|αντιγραφή|コピー|副本|복사본)(?:[ _]?\(?\d{1,2}\)?)?"
     rf"|[-_~](?:{EDITED_WORDS}|edit|crop|cropped|hdr|enhanced(?:-(?:nr|sr|rd)){{0,3}})(?P<double>\(\d{{1,2}}\))?)",
     re.IGNORECASE,
 )
@@ -31,6 +32,8 @@ _COPY_FOLDER = re.compile(
     r"|\(\d{1,2}\)$",
     re.IGNORECASE,
 )
+#: How programs that convert photographs name them where they keep the ending: DJI_0001.JPG.jpg.
+_CONVERTED = re.compile(r"(.+)\.(?:jpe?g|jpe|jfif|png|tiff?|dng|heic|heif|webp)", re.IGNORECASE)
 #: How iPhones name what was edited: IMG_E0001.JPG beside IMG_0001.HEIC.
 _EDITED_ON_PHONE = re.compile(r"(.*\bIMG_)E(\d{4})", re.IGNORECASE)
 
@@ -41,6 +44,8 @@ def first_stems(stem: str) -> list[str]:
     stem = unicodedata.normalize("NFC", stem)
     if match := _EDITED_ON_PHONE.fullmatch(stem):
         return ["".join(match.groups()).lower()]
+    if match := _CONVERTED.fullmatch(stem):
+        return [match[1].lower()]
     if match := _COPY_OF.fullmatch(stem):
         return [match["first"].lower()]
     if match := _COPY_NAME.fullmatch(stem):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -273,5 +274,12 @@ def _prefixes(folders: Sequence[Path]) -> list[str]:
     if len(folders) == 1:
         return [""]
     names = [to_colmap_name(folder.resolve().name) or "photographs" for folder in folders]
-    counts = Counter(names)
-    return [f"{name}_{k + 1}/" if counts[name] > 1 else f"{name}/" for k, name in enumerate(names)]
+    counts = Counter(name.lower() for name in names)  # on some disks names of other letters are one
+    found, taken = list[str](), {name for name, count in counts.items() if count == 1}
+    for number, name in enumerate(names, start=1):
+        written = name
+        if counts[name.lower()] > 1:
+            written = next(each for k in itertools.count(number) if (each := f"{name}_{k}").lower() not in taken)
+            taken.add(written.lower())
+        found.append(f"{written}/")
+    return found

@@ -29,6 +29,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm.cube_faces import cut_face
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.picture_colors import looks_visible
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_bytes
 from vdgs.system.stop_signals import check_stop_requested
@@ -87,7 +88,18 @@ def _beside_photographs(files: Sequence[Path]) -> dict[Path, Path]:
         photograph = by_name.get((file.parent, stem or file.stem.lower())) or by_stem.get((file.parent, stem))
         if photograph is not None and photograph != file:
             found[file] = photograph
-    return {mask: photograph for mask, photograph in found.items() if photograph not in found}
+    pictures = _in_color([mask for mask in found if masked_stem(mask.stem) is None])
+    return {mask: one for mask, one in found.items() if one not in found and mask not in pictures}
+
+
+def _in_color(files: Sequence[Path]) -> set[Path]:
+    """Those that show the colors of eyes, by some of each folder and ending: programs that convert photographs may
+    call them `x.JPG.jpg`, too."""
+    groups = defaultdict[tuple[Path, str], list[Path]](list)
+    for file in files:
+        groups[file.parent, file.suffix.lower()].append(file)
+    alike = groups.values()
+    return {file for each in alike if any(map(looks_visible, _spread(each))) for file in each}
 
 
 def check_mask(photo: ImageMetadata) -> None:
@@ -166,10 +178,15 @@ def _mask_notes(mask_folders: Sequence[Path], found: dict[Path, Path | None]) ->
 def _gray_fractions(masks: Sequence[Path]) -> dict[Path, float]:
     """How much of some masks is gray and left out, spread over those that there are; damaged ones are said later."""
     shares = dict[Path, float]()
-    for mask in masks[:: max(1, len(masks) // _GRAY_SAMPLE)][:_GRAY_SAMPLE]:
+    for mask in _spread(masks):
         with suppress(CaptureError):
             shares[mask] = gray_fraction(mask)
     return shares
+
+
+def _spread(masks: Sequence[Path]) -> Sequence[Path]:
+    """Some of them from everywhere."""
+    return masks[:: max(1, len(masks) // _GRAY_SAMPLE)][:_GRAY_SAMPLE]
 
 
 def _named_from(folder: Path, photographs: Collection[Path]) -> str:

@@ -16,9 +16,11 @@ from vdgs.geometry.geodesy import enu_from_geodetic
 from vdgs.sfm.image_metadata import UNKNOWN_CAMERA, ImageMetadata
 from vdgs.sfm.picture_colors import looks_visible
 
-#: How DJI names what cameras of one drone take at a moment: DJI_20240329124328_0001_T, maybe with a flight behind it.
+#: How DJI names what cameras of one drone take at a moment: DJI_20240329124328_0001_T, maybe with a flight behind it;
+#: DJI_0001_THRM by the first programs of the Zenmuse H20T.
 _DJI_NAME = re.compile(
-    r"(?:(?P<before>.*?)(?P<time>\d{14})|)(?P<number>.*?)_(?P<camera>[TSVWZ])(?P<after>_.*)?", re.IGNORECASE
+    r"(?:(?P<before>.*?)(?P<time>\d{14})|)(?P<number>.*?)_(?P<camera>[TSVWZ]|THRM|SCRN|WIDE|ZOOM)(?P<after>_.*)?",
+    re.IGNORECASE,
 )
 #: What names of pictures and folders of thermal cameras have in them: Autel's IRX_0001, thermal/, site_IR.
 _THERMAL_WORD = re.compile(
@@ -26,7 +28,7 @@ _THERMAL_WORD = re.compile(
     re.IGNORECASE,
 )
 #: What makers put behind the names of them (DJI's XT2: DJI_0001_R beside DJI_0001).
-_THERMAL_TAIL = re.compile(r".*_[RT](?:_.*)?", re.IGNORECASE)
+_THERMAL_TAIL = re.compile(r".*_(?:[RT]|THRM)(?:_.*)?", re.IGNORECASE)
 #: A name with the letter of a camera.
 _LETTERED = re.compile(r"(?P<number>.*)_(?P<letter>[A-Z])(?P<after>_.*)?", re.IGNORECASE)
 #: The letters of DJI's cameras, by which the picture of the screen is told; others are those of a rig.
@@ -85,13 +87,13 @@ def _beside(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[
     thermal, screen = dict[str, str](), dict[str, str]()
     for shots in moments.values():
         for match, photo in shots:
-            camera = match["camera"].upper()
+            camera = _letter(match)
             if camera not in "TS":
                 continue
             taken = [
                 other
                 for name, other in shots
-                if name["camera"].upper() in "VWZ" and _are_of_one_moment((match, photo), (name, other))
+                if _letter(name) in "VWZ" and _are_of_one_moment((match, photo), (name, other))
             ]
             if not any(_is_larger(each, photo) for each in taken):
                 continue
@@ -100,6 +102,11 @@ def _beside(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[
             elif _may_be_by_dji(photo) and _number_of(photo)[0] not in of_rigs:
                 screen[photo.name] = f"is the picture of the screen beside {taken[0].name}"
     return thermal, screen
+
+
+def _letter(name: re.Match[str]) -> str:
+    """Of the camera that DJI names: T(HRM), S(CRN), V, W(IDE) or Z(OOM)."""
+    return name["camera"][0].upper()
 
 
 def _may_be_by_dji(photo: ImageMetadata) -> bool:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from vdgs.captures.image_files import has_camera, mode_of, open_image
 from vdgs.captures.image_suffixes import IMAGE_SUFFIXES
@@ -25,8 +26,8 @@ _LAYER = re.compile(
 #: Words of the names of photographs, as opposed to those.
 _PHOTOGRAPH = re.compile(r"(?<![a-z])(rgba?|colou?r|image|img|frame|photo|view)(?![a-z])")
 _ONE_CHANNEL = {"L", "P", "1", "I", "F", "I;16", "I;16B", "I;16L"}
-#: Pictures looked at of each kind in a folder; colors of classes at most; of pixels that are no background the share
-#: that are unit vectors, and how far from 1 their length may be (choices).
+#: Pictures looked at of each kind in a folder; colors of classes, and of a palette of depth, at most; of pixels that
+#: are no background the share that are unit vectors, and how far from 1 their length may be (choices).
 _LOOKED_AT, _MAX_COLORS, _MIN_UNIT, _TOLERANCE = 3, 256, 0.9, 0.1
 
 
@@ -60,17 +61,27 @@ def _shows(kind: str, picture: Path, photograph: Path) -> bool:
     try:
         if has_camera(picture):
             return False
-        with open_image(photograph) as image:
-            mode = mode_of(image)
-        with open_image(picture) as image:
-            one_channel = mode_of(image) in _ONE_CHANNEL and mode_of(image) != mode
-            if kind == "depth" or one_channel:
-                return one_channel and kind != "normals"
+        with open_image(photograph) as shown, open_image(picture) as image:
+            if mode_of(image) in _ONE_CHANNEL and mode_of(image) != mode_of(shown):
+                return kind != "normals"
             if kind == "classes":
                 return image.mode in ("RGB", "RGBA", "P") and image.getcolors(_MAX_COLORS) is not None
-            return image.mode in ("RGB", "RGBA") and _are_unit_vectors(np.asarray(image.convert("RGB"))[::4, ::4])
+            if image.mode not in ("RGB", "RGBA"):
+                return False
+            if kind == "depth":
+                return _is_one_value(image) and not _is_one_value(shown)
+            return _are_unit_vectors(np.asarray(image.convert("RGB"))[::4, ::4])
     except Exception:  # of decoders: whether it is damaged is found when it is read as a photograph
         return False
+
+
+def _is_one_value(image: Image.Image) -> bool:
+    """Whether three channels show one value a pixel, as programs that estimate depth write it: gray, or the colors of a
+    palette."""
+    if image.getcolors(_MAX_COLORS) is not None:
+        return True
+    pixels = np.asarray(image.convert("RGB"))[::4, ::4]
+    return bool((pixels == pixels[..., :1]).all())
 
 
 def _are_unit_vectors(pixels: np.ndarray) -> bool:
