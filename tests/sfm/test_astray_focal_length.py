@@ -230,9 +230,12 @@ def test_one_tag_is_contradicted_by_little_where_photographs_plainly_tell_it(
     assert not focal_decision.is_contradicted(model, held, [GROUP], 1)
 
 
-@pytest.mark.parametrize("confirmed", [True, False])
-def test_a_focal_length_of_one_tag_that_photographs_tell_is_fitted_anew(tmp_path, monkeypatch, confirmed):
-    """Points that were made by a wrong focal length hold it there, however it is fitted afterwards."""
+@pytest.mark.parametrize(
+    ("confirmed", "deep", "anew"), [(True, 1.14, False), (False, 1.14, True), (False, 1.01, False)]
+)
+def test_a_focal_length_of_one_tag_that_flat_points_keep_is_fitted_anew(tmp_path, monkeypatch, confirmed, deep, anew):
+    """Points that were made by a wrong focal length hold it there, however it is fitted afterwards; where without the
+    flat ones it is the same, another model would be, too."""
     told = (False, focal_decision.OF_SHAPE)
     mapper = Mapper({True: model_of(FOCAL), False: model_of(1.14 * FOCAL)})
     monkeypatch.setattr(focal_decision, "should_fix_focal", lambda *_: (True, OF_FLIGHTS))
@@ -244,9 +247,14 @@ def test_a_focal_length_of_one_tag_that_photographs_tell_is_fitted_anew(tmp_path
     monkeypatch.setattr(incremental_mapper, "run_mapper", mapper)
     monkeypatch.setattr(mapping.global_mapper, "leaves_photographs_out", lambda _: False)
     silence_colmap()
+
+    def fit(model, _threads):
+        model.cameras[1].focal_length = deep * FOCAL
+
+    monkeypatch.setattr(focal_decision, "fit_focal", fit)
     groups, console = [replace(GROUP, is_confirmed=confirmed)], Console(quiet=True)
     monkeypatch.setattr(mapping.fisheyes, "candidates", lambda *_: [])
     models, held = mapping.map_photographs(plan, Workspace(tmp_path), groups, "key", 6, console)
-    assert models[0].cameras[1].focal_length == pytest.approx((1.0 if confirmed else 1.14) * FOCAL)
-    assert mapper.made == ([True] if confirmed else [True, False])
+    assert models[0].cameras[1].focal_length == pytest.approx((1.14 if anew else 1.0) * FOCAL)
+    assert mapper.made == ([True, False] if anew else [True])
     assert not held[0]

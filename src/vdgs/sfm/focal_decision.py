@@ -57,6 +57,9 @@ CLEARLY_NEARER = 0.05
 #: So does one that is off by so much less where they lie nearer by so much, if it is off by so many of the standard
 #: deviations that photographs leave of it (choices).
 PLAINLY_NEARER, FAR_OFF, SIGMAS_OFF = 0.1, 0.05, 5.0
+#: Rays that meet under less than this (degrees) are about parallel; without their points, if so many stay, a focal
+#: length that is fitted well is the same within so much (shares; choices).
+FLAT_DEG, DEEP_SHARE, ONE_FIT = 5.0, 0.3, 0.02
 #: Between these quantiles (5 % and 95 %) lie so many standard deviations of errors.
 ERRORS_RANGE = 3.29
 #: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
@@ -231,19 +234,27 @@ def focals_by_one_tag(groups: Sequence[CameraGroup]) -> dict[int, float]:
     return {k: group.focal_px for k, group in enumerate(groups, 1) if group.has_focal_prior and not group.is_confirmed}
 
 
-def is_told_of_one_tag(
-    model: pycolmap.Reconstruction, meant: tuple[bool, str], held: tuple[bool, str], groups: Sequence[CameraGroup]
+def is_kept_by_flat_points(
+    model: pycolmap.Reconstruction,
+    meant: tuple[bool, str],
+    held: tuple[bool, str],
+    groups: Sequence[CameraGroup],
+    threads: int,
 ) -> bool:
-    """Whether the photographs tell a focal length that was `meant` to be held at what one tag alone says. Points that a
-    wrong one made hold it where it was, however it is fitted: those that a camera shows which turns on the spot, to
-    which it gives a depth. Such a model is made anew."""
+    """Whether a focal length that was `meant` to be held at what one tag alone says, and was fitted since photographs
+    tell it, is another without the points whose rays are about parallel. Those of a camera that turns on the spot are
+    such: a wrong focal length gives them a depth, and they keep it where it was, however it is fitted."""
     placed = {image.camera_id for image in placed_images(model)}
-    return (
-        meant[0]
-        and meant[1] != OF_LINE
-        and held == (False, OF_SHAPE)
-        and bool(focals_by_one_tag(groups).keys() & placed)
-    )
+    fitted = focals_by_one_tag(groups).keys() & placed
+    if not (meant[0] and meant[1] != OF_LINE and held == (False, OF_SHAPE) and fitted):
+        return False
+    deep = pycolmap.Reconstruction(model)
+    pycolmap.ObservationManager(deep).filter_all_points3D(math.inf, FLAT_DEG)
+    if deep.num_points3D() < DEEP_SHARE * model.num_points3D():
+        return True  # too few are left to tell
+    fit_focal(deep, threads)
+    focals = [(model.cameras[k].mean_focal_length(), deep.cameras[k].mean_focal_length()) for k in fitted]
+    return any(abs(math.log(other / focal)) > ONE_FIT for focal, other in focals)
 
 
 def is_astray(model: pycolmap.Reconstruction, held: tuple[bool, str], groups: Sequence[CameraGroup]) -> bool:

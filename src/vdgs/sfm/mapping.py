@@ -64,8 +64,8 @@ def _mapped_as_told(
             return models, held
         if focal_decision.is_contradicted(models[0], held, kinds, plan.threads):
             why = "the photographs contradict the focal length that is held; it is fitted, all anew"
-        elif focal_decision.is_told_of_one_tag(models[0], meant, held, kinds):
-            why = "the photographs tell the focal length that one tag alone says; it is fitted, all anew"
+        elif focal_decision.is_kept_by_flat_points(models[0], meant, held, kinds, plan.threads):
+            why = "the photographs tell another focal length than one tag alone says; it is fitted, all anew"
         elif not meant[0] and focal_decision.is_astray(models[0], held, kinds):
             why = "the fitted focal length is far from what tags that agree say; it is held, all anew"
             incremental_mapper.set_models_aside(workspace, workspace.models_fitted)
