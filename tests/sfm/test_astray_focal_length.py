@@ -13,11 +13,11 @@ pycolmap = pytest.importorskip("pycolmap")
 
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
-from vdgs.sfm import incremental_mapper, mapping  # noqa: E402
+from vdgs.sfm import focal_decision, incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
 from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
+from vdgs.sfm.focal_decision import ASKED, CONFIRMED, OF_FLIGHTS, is_astray, is_held_as_good  # noqa: E402
 from vdgs.sfm.focal_length import Lens  # noqa: E402
-from vdgs.sfm.incremental_mapper import ASKED, CONFIRMED, OF_FLIGHTS, is_astray, is_held_as_good  # noqa: E402
 from vdgs.sfm.workspace import Workspace, silence_colmap  # noqa: E402
 
 FOCAL = 1280.0
@@ -89,23 +89,23 @@ def test_held_models_are_taken_where_they_are_as_good_or_the_fitted_lens_is_none
 
 def test_a_focal_length_that_is_released_and_goes_astray_is_held_again(monkeypatch):
     """Where each flight was level within the errors of altitudes, and the model shows several heights."""
-    monkeypatch.setattr(incremental_mapper, "MIN_OBLIQUE_SHARE", 0.0)
-    for focal, held in ((FOCAL, (False, incremental_mapper.OF_SHAPE)), (2 * FOCAL, (True, CONFIRMED))):
+    monkeypatch.setattr(focal_decision, "MIN_OBLIQUE_SHARE", 0.0)
+    for focal, held in ((FOCAL, (False, focal_decision.OF_SHAPE)), (2 * FOCAL, (True, CONFIRMED))):
         models = [model_of()]
 
         def fit(model, _threads, focal=focal):
             model.cameras[1].focal_length = focal
 
-        monkeypatch.setattr(incremental_mapper, "fit_focal", fit)
-        assert incremental_mapper.release_focal(models, (True, OF_FLIGHTS), [GROUP], 1) == held
+        monkeypatch.setattr(focal_decision, "fit_focal", fit)
+        assert focal_decision.release_focal(models, (True, OF_FLIGHTS), [GROUP], 1) == held
         assert models[0].cameras[1].focal_length == FOCAL
 
 
 @pytest.mark.parametrize(("nearer", "held"), [(0.003, True), (0.03, False)])
 def test_parallel_views_along_a_line_tell_it_where_points_lie_nearer_once_it_is_fitted(monkeypatch, nearer, held):
     """A tower climbed with a tag that is off by 4 %: held, by which points lie 4 % farther, the line bends by 1 %."""
-    monkeypatch.setattr(incremental_mapper, "MIN_OBLIQUE_SHARE", 2.0)
-    monkeypatch.setattr(incremental_mapper, "MIN_HEIGHT_SPREAD", 1e9)
+    monkeypatch.setattr(focal_decision, "MIN_OBLIQUE_SHARE", 2.0)
+    monkeypatch.setattr(focal_decision, "MIN_HEIGHT_SPREAD", 1e9)
     models = [model_of(1.04 * FOCAL)]
 
     def fit(model, _threads):
@@ -114,9 +114,9 @@ def test_parallel_views_along_a_line_tell_it_where_points_lie_nearer_once_it_is_
     def error_px(model):
         return 1.0 - nearer if model.cameras[1].focal_length == FOCAL else 1.0
 
-    monkeypatch.setattr(incremental_mapper, "fit_focal", fit)
-    monkeypatch.setattr(incremental_mapper, "mean_reprojection_error", error_px)
-    assert incremental_mapper.release_focal(models, (True, incremental_mapper.OF_LINE), [GROUP], 1)[0] is held
+    monkeypatch.setattr(focal_decision, "fit_focal", fit)
+    monkeypatch.setattr(focal_decision, "mean_reprojection_error", error_px)
+    assert focal_decision.release_focal(models, (True, focal_decision.OF_LINE), [GROUP], 1)[0] is held
     assert models[0].cameras[1].focal_length == pytest.approx((1.04 if held else 1.0) * FOCAL)
 
 
@@ -151,7 +151,7 @@ def mapped(
     monkeypatch.setattr(incremental_mapper, "run_mapper", mapper)
     monkeypatch.setattr(mapping.global_mapper, "leaves_photographs_out", lambda _: False)
     if focal == "auto":
-        monkeypatch.setattr(incremental_mapper, "should_fix_focal", lambda *_: FITTED)
+        monkeypatch.setattr(focal_decision, "should_fix_focal", lambda *_: FITTED)
     with console.capture() as said:
         models, held = mapping.map_photographs(plan, workspace, [GROUP], "key", 6, console)
     return models[0], held, said.get()
@@ -197,7 +197,7 @@ def test_fitting_the_focal_length_leaves_the_log_of_colmap_silent(capfd):
     model = model_of(images=4)
     before = model.cameras[1].focal_length
     model.cameras[1].focal_length = 1.05 * before
-    incremental_mapper.fit_focal(model, 1)
+    focal_decision.fit_focal(model, 1)
     assert model.cameras[1].focal_length == pytest.approx(before, rel=0.02)
     pycolmap.logging.info("told")
     assert capfd.readouterr() == ("", "")
@@ -217,26 +217,29 @@ def test_one_tag_is_contradicted_by_little_where_photographs_plainly_tell_it(
     def fit(model, _threads):
         model.cameras[1].focal_length = fitted * FOCAL
 
-    monkeypatch.setattr(incremental_mapper, "fit_focal", fit)
+    monkeypatch.setattr(focal_decision, "fit_focal", fit)
     monkeypatch.setattr(
-        incremental_mapper,
+        focal_decision,
         "mean_reprojection_error",
         lambda each: 1.0 if each.cameras[1].focal_length == FOCAL else 1.0 - nearer,
     )
-    monkeypatch.setattr(incremental_mapper, "focal_deviation", lambda _: deviation)
-    held = (True, incremental_mapper.OF_ONE_HEIGHT)
+    monkeypatch.setattr(focal_decision, "focal_deviation", lambda _: deviation)
+    held = (True, focal_decision.OF_ONE_HEIGHT)
     by_one = replace(GROUP, is_confirmed=False)
-    assert incremental_mapper.is_contradicted(model, held, [by_one], 1) is contradicted
-    assert not incremental_mapper.is_contradicted(model, held, [GROUP], 1)
+    assert focal_decision.is_contradicted(model, held, [by_one], 1) is contradicted
+    assert not focal_decision.is_contradicted(model, held, [GROUP], 1)
 
 
-@pytest.mark.parametrize("confirmed", [True, False])
-def test_a_focal_length_of_one_tag_that_photographs_tell_is_fitted_anew(tmp_path, monkeypatch, confirmed):
-    """Points that were made by a wrong focal length hold it there, however it is fitted afterwards."""
-    told = (False, incremental_mapper.OF_SHAPE)
+@pytest.mark.parametrize(
+    ("confirmed", "deep", "anew"), [(True, 1.14, False), (False, 1.14, True), (False, 1.01, False)]
+)
+def test_a_focal_length_of_one_tag_that_flat_points_keep_is_fitted_anew(tmp_path, monkeypatch, confirmed, deep, anew):
+    """Points that were made by a wrong focal length hold it there, however it is fitted afterwards; where without the
+    flat ones it is the same, another model would be, too."""
+    told = (False, focal_decision.OF_SHAPE)
     mapper = Mapper({True: model_of(FOCAL), False: model_of(1.14 * FOCAL)})
-    monkeypatch.setattr(incremental_mapper, "should_fix_focal", lambda *_: (True, OF_FLIGHTS))
-    monkeypatch.setattr(incremental_mapper, "release_focal", lambda *_: told)
+    monkeypatch.setattr(focal_decision, "should_fix_focal", lambda *_: (True, OF_FLIGHTS))
+    monkeypatch.setattr(focal_decision, "release_focal", lambda *_: told)
     plan = SimpleNamespace(
         image_list=SimpleNamespace(images=[]), threads=1, gps_priors=None,
         request=SimpleNamespace(options=SfmOptions()),
@@ -244,9 +247,14 @@ def test_a_focal_length_of_one_tag_that_photographs_tell_is_fitted_anew(tmp_path
     monkeypatch.setattr(incremental_mapper, "run_mapper", mapper)
     monkeypatch.setattr(mapping.global_mapper, "leaves_photographs_out", lambda _: False)
     silence_colmap()
+
+    def fit(model, _threads):
+        model.cameras[1].focal_length = deep * FOCAL
+
+    monkeypatch.setattr(focal_decision, "fit_focal", fit)
     groups, console = [replace(GROUP, is_confirmed=confirmed)], Console(quiet=True)
     monkeypatch.setattr(mapping.fisheyes, "candidates", lambda *_: [])
     models, held = mapping.map_photographs(plan, Workspace(tmp_path), groups, "key", 6, console)
-    assert models[0].cameras[1].focal_length == pytest.approx((1.0 if confirmed else 1.14) * FOCAL)
-    assert mapper.made == ([True] if confirmed else [True, False])
+    assert models[0].cameras[1].focal_length == pytest.approx((1.14 if anew else 1.0) * FOCAL)
+    assert mapper.made == ([True, False] if anew else [True])
     assert not held[0]

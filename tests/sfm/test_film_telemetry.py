@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime, timedelta
 from itertools import pairwise
 
@@ -216,6 +217,16 @@ def test_between_two_records_around_a_turn_there_is_no_position():
     bends = RecordBends(records)
     placed = [bends.checked(telemetry_at(records, t)).lat_lon is not None for t in (0.5, 1.5, 3.0, 3.3, 3.7, 5.5)]
     assert placed == [True, True, True, False, False, True]
+
+
+@pytest.mark.parametrize("radius", [15.0, 30.0])
+def test_around_something_positions_between_records_stay(radius):
+    """At 10 m/s and a record a second they cut the arc by 0.8 m and 0.4 m."""
+    turns = [10.0 * k / radius for k in range(40)]
+    records = _records([(radius * math.cos(turn), radius * math.sin(turn)) for turn in turns], 7)
+    bends = RecordBends(records)
+    assert bends.beside_m(20.5) == pytest.approx(radius * (1 - math.cos(5 / radius)), rel=0.05)
+    assert all(bends.checked(telemetry_at(records, t / 4)).lat_lon is not None for t in range(156))
 
 
 @pytest.mark.parametrize(("decimals", "step_m"), [(4, 11.1), (5, 1.11), (7, 0.0)])

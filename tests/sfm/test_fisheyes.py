@@ -16,12 +16,12 @@ pycolmap = pytest.importorskip("pycolmap")
 from vdgs.captures.reconstruction import CameraReport, read_digests  # noqa: E402
 from vdgs.config.sfm_options import SfmOptions, SfmRequest  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
-from vdgs.sfm import fisheyes, incremental_mapper, mapping  # noqa: E402
+from vdgs.sfm import fisheyes, focal_decision, mapping  # noqa: E402
 from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
 from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
+from vdgs.sfm.focal_decision import CONTRADICTED  # noqa: E402
 from vdgs.sfm.focal_length import DIAGONAL_35_MM, Lens  # noqa: E402
 from vdgs.sfm.image_metadata import FISHEYE, RADIAL, attitude_from_gimbal  # noqa: E402
-from vdgs.sfm.incremental_mapper import CONTRADICTED  # noqa: E402
 from vdgs.sfm.reconstruction_plan import plan_reconstruction  # noqa: E402
 from vdgs.sfm.reconstruction_report import _warnings  # noqa: E402
 from vdgs.sfm.step_keys import step_keys  # noqa: E402
@@ -66,7 +66,7 @@ def mapped_model(mm: float, fisheye: bool, tilt: float) -> pycolmap.Reconstructi
         if len(track) >= 3:
             model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(*each) for each in track]), np.zeros(3))
     for largest_px in (20.0, 4.0):
-        incremental_mapper.fit_focal(model, 1)
+        focal_decision.fit_focal(model, 1)
         pycolmap.ObservationManager(model).filter_all_points3D(largest_px, 0.5)
     return model
 
@@ -147,7 +147,7 @@ def test_models_are_made_anew_with_fisheyes_once(tmp_path, monkeypatch, fails):
     monkeypatch.setattr(fisheyes, "use_lenses", lambda *_: None)
     for name, value in (("should_fix_focal", (False, "")), ("release_focal", (False, "")), ("is_contradicted", False),
                         ("is_astray", False)):  # fmt: skip
-        monkeypatch.setattr(incremental_mapper, name, lambda *_, value=value: value)
+        monkeypatch.setattr(focal_decision, name, lambda *_, value=value: value)
     monkeypatch.setattr(mapping, "replace", lambda _, **changes: SimpleNamespace(
         request=SimpleNamespace(options=SfmOptions()), gps_priors=None, threads=1,
         image_list=SimpleNamespace(images=[photo]), **{k: v for k, v in changes.items() if k == "images"}))  # fmt: skip

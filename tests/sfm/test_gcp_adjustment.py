@@ -23,7 +23,7 @@ from vdgs.captures.validation import validate_capture
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic
-from vdgs.sfm import capture_writer, incremental_mapper
+from vdgs.sfm import capture_writer, focal_decision
 from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.gcp_adjustment import Level, fit_surveyed, fit_to_gcps, gcp_accuracy, no_better_than_left
@@ -282,7 +282,7 @@ def test_a_point_that_does_not_fit_and_marks_that_are_wrong_are_named(made, flig
 
 @pytest.mark.parametrize(
     ("spread", "open_", "held"),
-    [(incremental_mapper.MIN_HEIGHT_SPREAD, 0.001, True), (0.0, 0.001, False), (0.0, 0.1, True)],
+    [(focal_decision.MIN_HEIGHT_SPREAD, 0.001, True), (0.0, 0.001, False), (0.0, 0.1, True)],
 )
 def test_a_focal_length_that_altitudes_leave_open_is_fitted_where_the_model_shows_several_heights(
     made, monkeypatch, spread, open_, held
@@ -290,13 +290,13 @@ def test_a_focal_length_that_altitudes_leave_open_is_fitted_where_the_model_show
     """And where its views differ enough in direction to tell it."""
     model = pycolmap.Reconstruction(made / "mapped")
     before = [camera.params.copy() for camera in model.cameras.values()]
-    monkeypatch.setattr(incremental_mapper, "MIN_HEIGHT_SPREAD", spread)  # any height is another one
-    monkeypatch.setattr(incremental_mapper, "focal_deviation", lambda _: open_)
-    found = incremental_mapper.release_focal([model], (True, incremental_mapper.OF_FLIGHTS), [], 1)
+    monkeypatch.setattr(focal_decision, "MIN_HEIGHT_SPREAD", spread)  # any height is another one
+    monkeypatch.setattr(focal_decision, "focal_deviation", lambda _: open_)
+    found = focal_decision.release_focal([model], (True, focal_decision.OF_FLIGHTS), [], 1)
     assert found[0] is held
     after = [camera.params for camera in model.cameras.values()]
     assert np.array_equal(before, after) is held
-    assert incremental_mapper.release_focal([model], (False, "asked for"), [], 1) == (False, "asked for")
+    assert focal_decision.release_focal([model], (False, "asked for"), [], 1) == (False, "asked for")
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.6, 1.5])
@@ -312,11 +312,11 @@ def test_a_focal_length_that_one_tag_alone_says_is_given_up_where_photographs_co
         images=(), is_confirmed=False,
     )  # fmt: skip
     why, groups = (True, "one height"), [group]
-    assert incremental_mapper.is_contradicted(model, why, groups, 1) is (factor != 1)
+    assert focal_decision.is_contradicted(model, why, groups, 1) is (factor != 1)
     assert model.cameras[1].focal_length == group.focal_px
-    for not_asked in ((False, "fitted"), (True, incremental_mapper.ASKED)):
-        assert not incremental_mapper.is_contradicted(model, not_asked, groups, 1)
-    assert not incremental_mapper.is_contradicted(model, why, [replace(group, is_confirmed=True)], 1)
+    for not_asked in ((False, "fitted"), (True, focal_decision.ASKED)):
+        assert not focal_decision.is_contradicted(model, not_asked, groups, 1)
+    assert not focal_decision.is_contradicted(model, why, [replace(group, is_confirmed=True)], 1)
 
 
 @pytest.mark.parametrize("flip", ["exchanged", "from the lower edge", "of half the size"])

@@ -17,7 +17,7 @@ pycolmap = pytest.importorskip("pycolmap")
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import VdgsError  # noqa: E402
 from vdgs.geometry.similarity import fit_similarity  # noqa: E402
-from vdgs.sfm import global_mapper, incremental_mapper, mapping  # noqa: E402
+from vdgs.sfm import focal_decision, global_mapper, incremental_mapper, mapping  # noqa: E402
 from vdgs.sfm.feature_matching import count_verified_matches  # noqa: E402
 from vdgs.sfm.workspace import Workspace, silence_colmap  # noqa: E402
 
@@ -196,10 +196,10 @@ def test_a_focal_length_that_the_photographs_contradict_is_fitted_anew_and_work_
         return [None]
 
     monkeypatch.setattr(mapping, "make_models", map_with)
-    monkeypatch.setattr(incremental_mapper, "is_contradicted", lambda *_: True)
+    monkeypatch.setattr(focal_decision, "is_contradicted", lambda *_: True)
     with pytest.raises(KeyboardInterrupt):
         mapping.map_photographs(plan, copied, [], "key", 16, CONSOLE)
-    assert mapping.map_photographs(plan, copied, [], "key", 16, CONSOLE)[1] == (False, incremental_mapper.CONTRADICTED)
+    assert mapping.map_photographs(plan, copied, [], "key", 16, CONSOLE)[1] == (False, focal_decision.CONTRADICTED)
     assert made == [True, False, False]
 
 

@@ -15,10 +15,10 @@ from vdgs.sfm.brackets import unused_exposures
 from vdgs.sfm.cross_checks import cross_checked
 from vdgs.sfm.exif_gps import FLAT, VOID, is_measured_in_xmp
 from vdgs.sfm.flights import flights_of
+from vdgs.sfm.focal_decision import _over_slope, should_fix_focal
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
 from vdgs.sfm.image_metadata import ImageMetadata, attitude_from_gimbal, read_image_metadata
-from vdgs.sfm.incremental_mapper import _over_slope, should_fix_focal
 from vdgs.sfm.map_datums import to_wgs84
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)

@@ -21,6 +21,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import georeferencing, georegistration
+from vdgs.sfm.focal_decision import OF_HEIGHTS, TAGS_DISAGREE, should_fix_focal
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, Lens, read_lens
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images, is_image_folder
@@ -30,7 +31,6 @@ from vdgs.sfm.image_metadata import (
     attitude_from_gimbal,
     read_image_metadata,
 )
-from vdgs.sfm.incremental_mapper import OF_HEIGHTS, TAGS_DISAGREE, should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.reconstruction_report import _lens_warnings, _photographs, _warnings

@@ -24,10 +24,10 @@ from vdgs.errors import CaptureError
 from vdgs.sfm.cross_checks import strays
 from vdgs.sfm.feature_extraction import write_upright_images
 from vdgs.sfm.find_images import find_files
+from vdgs.sfm.focal_decision import should_fix_focal
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images, is_image_folder
 from vdgs.sfm.image_metadata import read_image_metadata
-from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.mask_files import apply_orientation
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.lazy_pycolmap import pycolmap

@@ -16,6 +16,7 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.cross_checks import cross_checked, strays
 from vdgs.sfm.exif_gps import read_altitude, read_altitudes, read_place
 from vdgs.sfm.feature_extraction import group_by_camera
+from vdgs.sfm.focal_decision import should_fix_focal
 from vdgs.sfm.focal_length import AGREE, EQUIVALENT, SENSOR, read_lens
 from vdgs.sfm.gps_priors import read_gps_priors
 from vdgs.sfm.image_list import collect_images
@@ -28,7 +29,6 @@ from vdgs.sfm.image_metadata import (
     read_attitudes,
     read_image_metadata,
 )
-from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.preflight import make_preflight_report
 from vdgs.sfm.xmp import read_xmp
 

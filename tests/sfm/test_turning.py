@@ -92,6 +92,13 @@ def test_a_panorama_at_the_end_of_a_flight_leaves_its_depth(tmp_path):
     assert not only_turns(workspace_of(tmp_path, centers, rotations, 10.0, FOCAL))
 
 
+def test_a_flight_of_which_most_photographs_are_a_panorama_leaves_its_depth(tmp_path):
+    """Most pairs are of the panorama then, all of whose photographs match."""
+    centers = np.concatenate([line(8, 12.0), np.repeat(line(8, 12.0)[-1:], 56, axis=0)])
+    rotations = np.concatenate([turned(np.zeros(8), 20), turned(np.linspace(0, 350, 56), 20)])
+    assert not only_turns(workspace_of(tmp_path, centers, rotations, 10.0, FOCAL))
+
+
 def test_two_photographs_without_matches_are_not_called_a_turn(tmp_path):
     assert not only_turns(workspace_of(tmp_path, line(2, 500.0), turned(np.zeros(2), 0), 0.0, FOCAL))
 

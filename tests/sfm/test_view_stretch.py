@@ -14,16 +14,9 @@ from support.flown_models import FOCAL, HEIGHT, WIDTH, flown_model
 from vdgs.captures.reconstruction import OVER_GROUND, OVER_MEDIAN, AccuracyFacts
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.geometry.similarity import Similarity
-from vdgs.sfm import incremental_mapper
+from vdgs.sfm import focal_decision
 from vdgs.sfm.feature_extraction import CameraGroup
-from vdgs.sfm.focal_information import focal_deviation
-from vdgs.sfm.focal_length import Lens
-from vdgs.sfm.georeferencing import Georeferenced, georeference
-from vdgs.sfm.georegistration import Georegistration
-from vdgs.sfm.gps_priors import GpsPriors
-from vdgs.sfm.image_list import ImageList
-from vdgs.sfm.image_metadata import attitude_from_gimbal
-from vdgs.sfm.incremental_mapper import (
+from vdgs.sfm.focal_decision import (
     ASKED,
     OF_HEIGHTS,
     OF_LENSES,
@@ -33,6 +26,13 @@ from vdgs.sfm.incremental_mapper import (
     adjust,
     release_focal,
 )
+from vdgs.sfm.focal_information import focal_deviation
+from vdgs.sfm.focal_length import Lens
+from vdgs.sfm.georeferencing import Georeferenced, georeference
+from vdgs.sfm.georegistration import Georegistration
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.image_list import ImageList
+from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reconstruction_report import _advice, _flown_heights, _relief_explains, focal_reason
 from vdgs.sfm.view_stretch import SAID_SHARE, Known, Stretch, factor_of_heights, stretched, with_stretch
@@ -256,7 +256,7 @@ def test_a_report_says_once_what_told_the_focal_length():
     said = focal_reason(OF_PARALLEL, "recorded altitudes")
     assert said == f"{OF_PARALLEL}; then by recorded altitudes"
     assert focal_reason(said, "tags") == f"{OF_PARALLEL}; then by tags"
-    assert focal_reason(said) == OF_PARALLEL == incremental_mapper.OF_PARALLEL
+    assert focal_reason(said) == OF_PARALLEL == focal_decision.OF_PARALLEL
 
 
 def test_the_advice_promises_nothing_of_a_second_height_but_what_recorded_heights_tell():

@@ -17,7 +17,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import feature_matching, reconstruct
 from vdgs.sfm.feature_extraction import count_features
-from vdgs.sfm.incremental_mapper import should_fix_focal
+from vdgs.sfm.focal_decision import should_fix_focal
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.step_keys import step_keys
 from vdgs.sfm.workspace import Workspace

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,9 +62,10 @@ class _Inputs:
             files += [each.path for each in os.scandir(folder) if _is_picture(each.name) and not each.is_dir()]
         found = {file: _stamp(file) for file in files}
         if os.path.isdir(self.own_capture):
+            within = len(os.path.dirname(self.own_capture).rstrip(os.sep)) + 1  # faster than relpath for each of them
             for file in _files(self.own_capture):
-                if os.path.relpath(file, self.own_capture).split(os.sep)[0] not in _OWN_RECORDS:
-                    found[os.path.relpath(file, os.path.dirname(self.own_capture))] = _stamp(file)
+                if file[within:].split(os.sep)[1] not in _OWN_RECORDS:
+                    found[file[within:]] = _stamp(file)
         return found
 
 
@@ -92,7 +94,8 @@ def note_inputs(run: RunFolder, request: RunRequest, capture: Capture, began_ns:
         if _recorded(run) != (inputs, files):
             write_json(run.path / INPUTS_FILE, {"named": named, "folders": inputs.folders, "files": files})
     except (OSError, VdgsError):
-        (run.path / INPUTS_FILE).unlink(missing_ok=True)
+        with suppress(OSError):  # a disk that takes no changes; what is recorded there is of other stamps
+            (run.path / INPUTS_FILE).unlink(missing_ok=True)
 
 
 def are_inputs_unchanged(run: RunFolder, request: RunRequest) -> bool:

@@ -18,9 +18,9 @@ from vdgs.config.sfm_options import SfmOptions
 from vdgs.sfm.capture_writer import is_impossible, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup, group_by_camera
 from vdgs.sfm.feature_matching import match_pairs
+from vdgs.sfm.focal_decision import fit_focal
 from vdgs.sfm.focal_length import DIAGONAL_35_MM, alike
 from vdgs.sfm.image_metadata import FISHEYE, RADIAL, ImageMetadata
-from vdgs.sfm.incremental_mapper import fit_focal
 from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import read_json_or_empty, write_json

@@ -20,11 +20,11 @@ from vdgs.sfm import gcp_adjustment, georegistration
 from vdgs.sfm.attitude_readings import confirmed_by_model
 from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.bending import bend_to_positions, tell_level
+from vdgs.sfm.focal_decision import OF_LENSES
 from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.height_units import GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M, of_gps, with_height_unit
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.incremental_mapper import OF_LENSES
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
 from vdgs.sfm.scale_bars import known_scale

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.errors import CaptureError
-from vdgs.sfm import fisheyes, global_mapper, incremental_mapper
+from vdgs.sfm import fisheyes, focal_decision, global_mapper, incremental_mapper
 from vdgs.sfm.camera_rigs import map_rigs, take_rigs_apart
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
@@ -55,18 +55,18 @@ def _mapped_as_told(
 ) -> tuple[list[pycolmap.Reconstruction], tuple[bool, str]]:
     """The models by these lenses, and whether the focal length was held and why; anew where the first, which may be
     given, show that it must not be, or must be."""
-    meant = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)
+    meant = focal_decision.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)
     fitting, holding = _keys_anew(key)
     if not _is_begun_anew(workspace, key):
         models = first or make_models(plan, workspace, key, count, meant[0], console)
-        held = incremental_mapper.release_focal(models, meant, kinds, plan.threads)
+        held = focal_decision.release_focal(models, meant, kinds, plan.threads)
         if workspace.is_done("focal", key):
             return models, held
-        if incremental_mapper.is_contradicted(models[0], held, kinds, plan.threads):
+        if focal_decision.is_contradicted(models[0], held, kinds, plan.threads):
             why = "the photographs contradict the focal length that is held; it is fitted, all anew"
-        elif incremental_mapper.is_told_of_one_tag(models[0], meant, held, kinds):
-            why = "the photographs tell the focal length that one tag alone says; it is fitted, all anew"
-        elif not meant[0] and incremental_mapper.is_astray(models[0], held, kinds):
+        elif focal_decision.is_kept_by_flat_points(models[0], meant, held, kinds, plan.threads):
+            why = "the photographs tell another focal length than one tag alone says; it is fitted, all anew"
+        elif not meant[0] and focal_decision.is_astray(models[0], held, kinds):
             why = "the fitted focal length is far from what tags that agree say; it is held, all anew"
             incremental_mapper.set_models_aside(workspace, workspace.models_fitted)
         else:
@@ -75,7 +75,7 @@ def _mapped_as_told(
         console.print(f"[yellow]note[/] {why}", highlight=False)
     if not meant[0]:
         return _held_anew(plan, workspace, holding, count, meant, console)
-    return make_models(plan, workspace, fitting, count, False, console), (False, incremental_mapper.CONTRADICTED)
+    return make_models(plan, workspace, fitting, count, False, console), (False, focal_decision.CONTRADICTED)
 
 
 def _keys_anew(key: str) -> tuple[str, str]:
@@ -97,7 +97,7 @@ def _find_fisheyes(
 ) -> tuple[list[pycolmap.Reconstruction], list[int]]:
     """The models with lenses as tags say them, and the numbers of cameras that they show to be fisheyes; all that may
     be where there is no model."""
-    held = incremental_mapper.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)[0]
+    held = focal_decision.should_fix_focal(plan.image_list.images, plan.gps_priors, plan.request.options)[0]
     try:
         models = make_models(plan, workspace, key, count, held, console)
     except CaptureError as error:
@@ -133,8 +133,8 @@ def _held_anew(
         models = []
         console.print(f"[yellow]note[/] with the focal length held: {escape(str(error))}", highlight=False)
     fitted = incremental_mapper.read_models(workspace, workspace.models_fitted)
-    if incremental_mapper.is_held_as_good(models, fitted):
-        return models, (True, incremental_mapper.CONFIRMED)
+    if focal_decision.is_held_as_good(models, fitted):
+        return models, (True, focal_decision.CONFIRMED)
     console.print("[yellow]note[/] held, the photographs fit together worse; it stays fitted", highlight=False)
     return fitted, meant
 

@@ -22,7 +22,7 @@ from vdgs.config.ranges import check_ranges
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import VdgsError
 from vdgs.kernels import default_num_threads
-from vdgs.sfm import feature_matching, fisheyes, flights, incremental_mapper
+from vdgs.sfm import feature_matching, fisheyes, flights, focal_decision
 from vdgs.sfm.console_report import print_preflight
 from vdgs.sfm.gcp_list import GcpList, check_gcps_near, read_gcp_list
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors, read_gps_priors
@@ -150,7 +150,7 @@ def _read_gcps(options: SfmOptions, collection: ImageList, positions: GpsPriors)
 def print_plan(reconstruction_plan: ReconstructionPlan, takes: str, console: Console) -> None:
     """Print the look, what will be done, and how long that `takes`."""
     photographs, options = reconstruction_plan.image_list.images, reconstruction_plan.request.options
-    held, why = incremental_mapper.should_fix_focal(photographs, reconstruction_plan.gps_priors, options)
+    held, why = focal_decision.should_fix_focal(photographs, reconstruction_plan.gps_priors, options)
     how = "near each other by their positions" if reconstruction_plan.gps_priors.usable else (
         "all with all" if len(photographs) <= options.exhaustive_max else "next in order, and alike")  # fmt: skip
     meters = "metres east, north, up, " if reconstruction_plan.gps_priors.usable or reconstruction_plan.gcps else ""

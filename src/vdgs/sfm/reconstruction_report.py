@@ -25,6 +25,7 @@ from vdgs.sfm.camera_rigs import describe_rigs
 from vdgs.sfm.capture_writer import lens_of, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.fisheyes import MAX_FISHEYE_MM, equivalent_mm
+from vdgs.sfm.focal_decision import CONTRADICTED, TAGS_DISAGREE
 from vdgs.sfm.gcp_adjustment import MARK_WRONG_PX
 from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georeferencing import Georeferenced
@@ -32,7 +33,7 @@ from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import RADIAL, ImageMetadata
-from vdgs.sfm.incremental_mapper import CONTRADICTED, TAGS_DISAGREE, refined_cameras
+from vdgs.sfm.incremental_mapper import refined_cameras
 from vdgs.sfm.preflight import (
     LEVEL_TILT_DEG,
     MIN_OVERLAP,

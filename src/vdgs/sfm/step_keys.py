@@ -7,8 +7,8 @@ from typing import Any
 from vdgs.errors import CaptureError
 from vdgs.sfm import fisheyes
 from vdgs.sfm.feature_extraction import group_by_camera
+from vdgs.sfm.focal_decision import should_fix_focal
 from vdgs.sfm.image_metadata import RADIAL
-from vdgs.sfm.incremental_mapper import should_fix_focal
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.workspace import cache_key
 from vdgs.system.content_digests import ContentDigests

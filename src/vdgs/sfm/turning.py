@@ -10,6 +10,7 @@ as much, what turns shifts more towards the edges, by a square that only an endl
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,8 +100,25 @@ def _turned(rays: np.ndarray, onto: np.ndarray, weights: np.ndarray) -> np.ndarr
     return np.einsum("pij,pj,pjk,pmk->pmi", left, sign, right, rays)
 
 
+def _of_each_photograph(pairs: Sequence[tuple[int, int]], rng: np.random.Generator) -> list[tuple[int, int]]:
+    """So many pairs by chance, about as many of each photograph: where a camera turned on the spot for long all
+    photographs match there, and hardly any pairs are of the flight."""
+    left: dict[int, list[int]] = {}
+    for k in rng.permutation(len(pairs)).tolist():
+        for number in pairs[k]:
+            left.setdefault(number, []).append(k)
+    chosen, most = set[int](), min(PAIRS, len(pairs))
+    while len(chosen) < most:
+        for number in rng.permutation(sorted(left)).tolist():
+            while left[number] and left[number][-1] in chosen:
+                left[number].pop()
+            if left[number] and len(chosen) < most:
+                chosen.add(left[number].pop())
+    return [pairs[k] for k in sorted(chosen)]
+
+
 def _matches(workspace: Workspace, model: pycolmap.Reconstruction | None) -> _Matches | None:
-    """Matches of pairs by chance, always the same; None where there are none to look at."""
+    """Matches of pairs by chance, the same each time; None where there are none to look at."""
     with workspace.open_database() as database:
         known = {image.image_id: image for image in database.read_all_images()}
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
@@ -121,7 +139,7 @@ def _matches(workspace: Workspace, model: pycolmap.Reconstruction | None) -> _Ma
             and known[pair[0]].frame_id != known[pair[1]].frame_id  # those of a rig are of one place anyway
         ]
         rng = np.random.default_rng(0)
-        pairs = [pairs[k] for k in sorted(rng.permutation(len(pairs))[:PAIRS])]
+        pairs = _of_each_photograph(pairs, rng)
         if not pairs:
             return None
         rays, there = np.zeros((2, len(pairs), MATCHES, 2)), np.zeros((len(pairs), MATCHES), bool)

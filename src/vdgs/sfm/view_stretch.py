@@ -18,12 +18,12 @@ from vdgs.captures.position_adjustment import DRIFT_M, PositionFit, Problem
 from vdgs.captures.position_fit import fit_positions
 from vdgs.sfm.capture_writer import placed_images
 from vdgs.sfm.flights import FIXED_M, flights_of
+from vdgs.sfm.focal_decision import ASKED, MIN_OBLIQUE_SHARE, adjust
 from vdgs.sfm.focal_information import focal_deviation
 from vdgs.sfm.focal_length import CALIBRATED_SOURCE, alike
 from vdgs.sfm.georegistration import Georegistration, match_positions, problem_of, viewing_distance
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
-from vdgs.sfm.incremental_mapper import ASKED, MIN_OBLIQUE_SHARE, adjust
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.up_direction import up_of
 from vdgs.system.lazy_pycolmap import pycolmap

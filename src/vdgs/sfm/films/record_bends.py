@@ -17,6 +17,8 @@ MAX_BESIDE_M = 1.0
 _STEPS_DEG, _DEGREE_M = (1e-3, 1e-4, 1e-5), 111_000.0
 #: Rounded positions on a straight way bend by up to so many steps at two records together.
 _STEPS_OF_BENDS = 4.0
+#: Between records of an arc the way lies by this share of both bends as far beside as it would at a corner.
+_EVENLY = 0.25
 
 
 class RecordBends:
@@ -32,10 +34,14 @@ class RecordBends:
         if len(placed) > 2:
             at = enu_from_geodetic(np.c_[places, np.zeros(len(places))], (*places[0].tolist(), 0.0))
             self._bends[1:-1] = np.linalg.norm(at[2:] - 2 * at[1:-1] + at[:-2], axis=1)
+            self._bends[[0, -1]] = self._bends[[1, -2]]  # as far as is known
 
     def beside_m(self, seconds: float) -> float:
-        """How far a position that is interpolated at a moment may lie beside the way, in metres: a corner between two
-        records bends by as much at both together as the speed changes there."""
+        """How far a position that is interpolated at a moment may lie beside the way, in metres.
+
+        A corner between two records bends by as much at both together as the speed changes there, and not at those
+        around them. A way that bends as much there, as around something, turns evenly: a quarter as far beside.
+        """
         after = int(np.searchsorted(self._times, seconds, side="right"))
         if not 0 < after < len(self._times):
             return 0.0
@@ -43,8 +49,11 @@ class RecordBends:
         if not 0 < span <= MAX_GAP_S:
             return 0.0
         share = (seconds - float(self._times[after - 1])) / span
-        bent = max(0.0, float(self._bends[after - 1 : after + 1].sum()) - _STEPS_OF_BENDS * self.step_m)
-        return share * (1 - share) * bent
+        bends = self._bends[after - 1 : after + 1]
+        around = self._bends[[max(after - 2, 0), min(after + 1, len(self._bends) - 1)]]
+        evenly = float(np.minimum(bends, around).sum())
+        bent = float(bends.sum()) - evenly + _EVENLY * evenly
+        return share * (1 - share) * max(0.0, bent - _STEPS_OF_BENDS * self.step_m)
 
     def checked(self, known: Telemetry) -> Telemetry:
         """What is known at a moment, without the position if that may lie far beside the way."""
