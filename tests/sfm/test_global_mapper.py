@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tests.support.marked_photographs import write_camera, write_photograph
+
 pycolmap = pytest.importorskip("pycolmap")
 
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
@@ -47,21 +49,13 @@ def workspace_of(folder, bridge: int) -> Workspace:
     with workspace.open_database() as database:
         camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", FOCAL, WIDTH, HEIGHT)
         camera.has_prior_focal_length = True
-        number = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
-        database.write_rig(rig)
-        seen = {}
+        number, seen = write_camera(database, camera), {}
         for index, center in enumerate(cameras):
             away = points - center
             pixels = np.c_[WIDTH / 2 + FOCAL * away[:, 0] / -away[:, 2], HEIGHT / 2 - FOCAL * away[:, 1] / -away[:, 2]]
             shown = np.flatnonzero(((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1))
-            image = database.write_image(pycolmap.Image(name=f"{index:02d}.jpg", camera_id=number))
-            frame = pycolmap.Frame()
-            frame.rig_id = 1
-            frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number), image))
-            database.write_frame(frame)
-            database.write_keypoints(image, (pixels[shown] + rng.normal(0, 0.2, (len(shown), 2))).astype(np.float32))
+            marks = pixels[shown] + rng.normal(0, 0.2, (len(shown), 2))
+            image = write_photograph(database, f"{index:02d}.jpg", number, marks)
             seen[image] = {point: k for k, point in enumerate(shown.tolist())}
         names = {}
         for one in seen:

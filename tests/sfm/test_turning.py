@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.support.marked_photographs import write_camera, write_photograph
+
 pycolmap = pytest.importorskip("pycolmap")
 
 from vdgs.errors import CaptureError  # noqa: E402
@@ -29,22 +31,15 @@ def workspace_of(folder: Path, centers: np.ndarray, rotations: np.ndarray, relie
     workspace.images.mkdir(parents=True)
     points = np.column_stack([rng.uniform(-300, 300, (4000, 2)), rng.uniform(0, max(relief, 1e-9), 4000)])
     with workspace.open_database() as database:
-        number = database.write_camera(pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", focal, WIDTH, HEIGHT))
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
-        database.write_rig(rig)
-        seen = {}
+        lens = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", focal, WIDTH, HEIGHT)
+        number, seen = write_camera(database, lens), {}
         for k, (center, rotation) in enumerate(zip(centers, rotations, strict=True)):
             rays = (points - center) @ rotation.T
             pixels = FOCAL * rays[:, :2] / rays[:, 2:] + [WIDTH / 2, HEIGHT / 2]
             inside = (rays[:, 2] > 1) & (pixels > 0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1)
             shown = np.flatnonzero(inside)
-            image = database.write_image(pycolmap.Image(name=f"{k:02}.jpg", camera_id=number))
-            frame = pycolmap.Frame()
-            frame.rig_id = 1
-            frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number), image))
-            database.write_frame(frame)
-            database.write_keypoints(image, (pixels[shown] + rng.normal(0, 0.3, (len(shown), 2))).astype(np.float32))
+            marks = pixels[shown] + rng.normal(0, 0.3, (len(shown), 2))
+            image = write_photograph(database, f"{k:02}.jpg", number, marks)
             seen[image] = {point: mark for mark, point in enumerate(shown.tolist())}
         for one in seen:
             for other in [each for each in seen if each > one]:
