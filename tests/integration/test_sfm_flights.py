@@ -115,6 +115,14 @@ def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
         reconstruct_if_needed(request, console())
 
 
+def test_photographs_one_by_one_are_asked_for_their_folder(flight, tmp_path):
+    """As a shell writes `vdgs run DCIM/*.JPG`."""
+    first, *more = sorted(flight.folder.glob("*.jpg"))
+    request = RunRequest(capture=first, output=tmp_path / "run", preset="laptop", extra_image_folders=tuple(more))
+    with pytest.raises(VdgsError, match="is a photograph"):
+        reconstruct_if_needed(request, console())
+
+
 # ------------------------------------------------------------------------------------------------- parts
 
 

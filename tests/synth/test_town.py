@@ -40,6 +40,7 @@ from vdgs.synth.moving_objects import make_moving_objects, place_moving_objects
 from vdgs.synth.ray_tracing import RayTracer
 from vdgs.synth.streets import make_street_plan
 from vdgs.synth.town import Town, build_town
+from vdgs.synth.true_visibility import view_ground_truth
 from vdgs.synth.zones import LandUse
 
 pytestmark = [pytest.mark.xdist_group("synth"), pytest.mark.slow]
@@ -131,6 +132,21 @@ def test_off_path_views_are_apart_and_true(capture: Path, town: Town) -> None:
         x, y, z = image.projection_center()
         if image.name.startswith("street"):  # as held by a person, in metres
             assert 1.5 < z - float(town.terrain.height_without_ponds(x, y)) < 3
+
+
+def test_visibility_off_the_path_is_that_of_the_middle_of_each_square(
+    capture: Path, model: pycolmap.Reconstruction, tracer: RayTracer
+) -> None:
+    truth, read = load_ground_truth(capture / "off_path"), load_capture(capture)
+    visibility = {view.name: truth.visibility_map(view) for view in read.off_path_views}
+    training = {view.name for view in read.train_views}
+    seeing = [camera_of(image) for image in model.images.values() if image.name in training]
+    for image in pycolmap.Reconstruction(str(capture / "off_path" / "sparse" / "0")).images.values():
+        if (found := visibility.get(image.name)) is not None and not image.name.startswith("street"):
+            _, exact = view_ground_truth(tracer, camera_of(image), seeing)
+            inner = [exact[row::4, column::4] for row in (1, 2) for column in (1, 2)]
+            is_between = (found[::4, ::4] >= np.min(inner, 0)) & (found[::4, ::4] <= np.max(inner, 0))
+            assert is_between.mean() > 0.95
 
 
 def test_off_path_figures_count_what_three_photographs_see(capture: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.capture_root import capture_root
+from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
 from vdgs.config.ranges import to_flag
@@ -25,6 +26,8 @@ def is_image_input(request: RunRequest) -> bool:
     if is_image_folder(request.capture):
         return True
     if request.extra_image_folders:
+        if request.capture.suffix.lower() in IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES and request.capture.is_file():
+            raise VdgsError(f"{request.capture}: is a photograph. Give the folder that the photographs are in.")
         raise VdgsError(
             f"{request.capture}: only folders of photographs alone can be several; a capture is given by itself."
         )
