@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,9 +18,6 @@ from vdgs.synth.synthetic_points import SparseCloud, observations_by_image
 from vdgs.synth.true_visibility import FlightStats, view_ground_truth
 from vdgs.system.atomic_files import write_json
 from vdgs.system.lazy_pycolmap import pycolmap
-
-#: Visibility of off-path views is counted once in each square of so many pixels: it takes most of the time.
-_OFF_PATH_STEP = 4
 
 
 def write_flight(folder: Path, flight: str, found: FlightStats) -> None:
@@ -53,16 +50,14 @@ def write_views(
     off_path: bool = False,
 ) -> None:
     """Depth of all photographs, and true visibility of those after the first `training` (which count as seeing).
-    `off_path`: of these alone, and visibility in the middle of each `_OFF_PATH_STEP` pixels along and across."""
+    `off_path`: of these alone."""
     for kind in ("views",) if off_path else ("views", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     seeing = [camera for _, camera in named[:training]]
 
     def write(index: int) -> None:
         name, camera = named[index]
-        depth, views = view_ground_truth(tracer, camera, [] if index < training or off_path else seeing)
-        if off_path:
-            views = _visibility_by_squares(tracer, camera, seeing)
+        depth, views = view_ground_truth(tracer, camera, [] if index < training else seeing)
         packed, bounds = pack_depth(depth)
         file = f"{Path(name).stem}.npz"
         if index < training:
@@ -72,15 +67,6 @@ def write_views(
 
     for count, _ in enumerate(pool.map(write, range(training if off_path else 0, len(named))), start=1):
         done(count)
-
-
-def _visibility_by_squares(tracer: RayTracer, camera: Camera, seeing: list[Camera]) -> np.ndarray:
-    """True visibility [height, width] uint16, in the middle of each square of pixels."""
-    # Pixels of a camera of larger ones have their centers in the middles; those at the edges may reach beyond.
-    columns, rows = -(-camera.width // _OFF_PATH_STEP), -(-camera.height // _OFF_PATH_STEP)
-    whole = replace(camera, width=columns * _OFF_PATH_STEP, height=rows * _OFF_PATH_STEP)
-    _, counts = view_ground_truth(tracer, whole.resized(columns, rows), seeing)
-    return counts.repeat(_OFF_PATH_STEP, 0).repeat(_OFF_PATH_STEP, 1)[: camera.height, : camera.width]
 
 
 def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: SparseCloud) -> None:
