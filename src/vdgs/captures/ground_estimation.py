@@ -372,8 +372,8 @@ def _with_seen_up(scene: _Scene, world: WorldPrior, warnings: list[str]) -> Worl
         return world
     angle = float(np.degrees(np.arccos(np.clip(world.rotation[2] @ up, -1, 1))))
     warnings.append(
-        f"{world.how}, but cameras and points tell another up, {angle:.0f} degrees away, which is used ({how}). If that "
-        "is wrong, --up z."
+        f"{world.how}, but cameras and points tell another up, {angle:.0f} degrees away, which is used ({how}). If "
+        "that is wrong, --up z."
     )
     return replace(world, rotation=rotation_to_z(up), how=how)
 
