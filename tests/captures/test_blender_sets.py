@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from support.captures import TinyScene, assert_sees_the_scene
+from support.captures import TinyScene, assert_sees_the_scene, moved
 from support.dataset_layouts import halves, write_blender
 from vdgs.captures.format_dispatch import read_source
+from vdgs.captures.formats.json_poses import axis_rotation
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -197,3 +198,16 @@ def test_scaled_cameras_are_the_same_cameras(tmp_path, both, scale):
 
     change_files(tmp_path, enlarge)
     assert_sees_the_scene(load_capture(tmp_path), both)
+
+
+@pytest.mark.parametrize("degrees", [0, 25, 90])
+def test_worlds_that_are_not_blenders_have_the_up_that_cameras_see(tmp_path, scene, degrees):
+    """COLMAP's worlds lie anyhow, and converters write them as sets of Blender too."""
+    turn = axis_rotation(0, degrees)
+    write_blender(tmp_path, *halves(moved(scene, 0.3, turn, np.zeros(3))))
+    capture = load_capture(tmp_path)
+    up = capture.ground.rotation[2] @ turn[:, 2]
+    assert np.degrees(np.arccos(min(up, 1.0))) < 3
+    said = [note for note in capture.warnings if "another up" in note]
+    assert [f"{degrees + 1} degrees" in note or f"{degrees} degrees" in note for note in said] == [True] * bool(degrees)
+    assert load_capture(tmp_path, CaptureOptions(up="z")).ground.rotation[2] == pytest.approx((0, 0, 1))

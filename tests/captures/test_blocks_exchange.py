@@ -198,10 +198,10 @@ def test_heights_above_a_geoid_without_its_grid_are_said(tmp_path, flight):
 
 @pytest.mark.parametrize("in_pixels", [True, False])
 def test_fisheyes_are_bentleys(tmp_path, flight, in_pixels):
-    """A focal matrix, or a focal length, for angles in quarter turns, and a polynomial of them."""
+    """A focal matrix for angles in quarter turns, or a focal length for radians, and a polynomial of the former."""
     xml = blocks_xml(flight, None, tie_points=False).replace(">Perspective<", ">Fisheye<")
     write_ply(tmp_path / "points.ply", flight.points, np.zeros((900, 3), np.uint8))
-    matrix = np.array([[5000.0, 2.0], [-1.0, 4990.0]]) if in_pixels else np.diag([3656.4, 3656.4])
+    matrix = np.array([[5000.0, 2.0], [-1.0, 4990.0]]) if in_pixels else np.diag([3656.4, 3656.4]) * np.pi / 2
     if in_pixels:
         tags = [f"M_{row}{column}" for row in range(2) for column in range(2)]
         inner = "".join(f"<{tag}>{value}</{tag}>" for tag, value in zip(tags, matrix.ravel(), strict=True))

@@ -302,3 +302,16 @@ def test_real_models_agree_with_pycolmap(name):
     assert {view.name for view in model.views} == set(poses)
     for view in model.views:
         np.testing.assert_allclose(view.camera_from_world[:3], poses[view.name], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_names_may_be_in_the_letters_of_windows(tmp_path, text):
+    scene = tiny_scene()
+    cameras = {f"Flächen/{name}": camera for name, camera in scene.cameras.items()}
+    scene = TinyScene(cameras, scene.points, scene.colors)
+    folder = write_colmap(tmp_path, scene, text=text, images=None)
+    file = folder / f"images.{'txt' if text else 'bin'}"
+    plain = file.read_bytes()
+    file.write_bytes(plain.replace("ä".encode(), "ä".encode("cp1252")))
+    assert file.read_bytes() != plain
+    assert_same(read_colmap(folder), scene)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from support.metashape_files import LOCAL, WGS84, metashape_xml
 from support.true_flight import ORIGIN, true_flight, words
 from vdgs.captures.capture import Capture
 from vdgs.captures.formats.brown_lens import brown_intrinsics, unproject_pixels
+from vdgs.captures.formats.project_photographs import find_photographs
 from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import model_below
 from vdgs.captures.output_guard import is_capture
@@ -180,3 +182,35 @@ def test_exports_without_poses_do_not_stand_in_the_way_of_photographs(tmp_path, 
     for name in ("markers.xml", "bulk.xml"):
         with pytest.raises(CaptureError, match="no camera of it has a pose"):
             load_capture(tmp_path / name)
+
+
+def _found(root, names, **options):
+    return find_photographs(root, CaptureOptions(**options), [(name,) for name in names], root / "project.xml")
+
+
+def test_photographs_of_other_folders_stand_in_for_none(tmp_path):
+    """Cards number the photographs of each folder anew."""
+    for folder, numbers in (("100MEDIA", range(6, 9)), ("101MEDIA", range(1, 9))):
+        (tmp_path / folder).mkdir()
+        for k in numbers:
+            (tmp_path / folder / f"DJI_{k:04d}.JPG").touch()
+    names = [f"D:\\DCIM\\{100 + (k < 5)}MEDIA\\DJI_{k:04d}.JPG" for k in range(1, 9)]
+    found = _found(tmp_path, names)
+    assert [path.is_file() for path in found.paths] == [True] * 4 + [False] + [True] * 3
+    assert not (tmp_path / found.names[4]).is_file()
+    assert "DCIM/100MEDIA/DJI_0005.JPG, for which 101MEDIA/DJI_0005.JPG is there" in found.warnings[0]
+    shutil.rmtree(tmp_path / "100MEDIA")
+    with pytest.raises(CaptureError, match=r"4 of its 8 photographs are only in other folders .* with --images"):
+        _found(tmp_path, names)
+    assert all(path.is_file() for path in _found(tmp_path, names, images="101MEDIA").paths)  # a person says so
+    (tmp_path / "101MEDIA").rename(tmp_path / "all of them")
+    assert all(path.is_file() for path in _found(tmp_path, names).paths)
+
+
+def test_folders_above_that_are_others_count_too(tmp_path):
+    (tmp_path / "flight2" / "images").mkdir(parents=True)
+    for k in range(3):
+        (tmp_path / "flight2" / "images" / f"{k}.jpg").touch()
+    with pytest.raises(CaptureError, match="3 of its 3 photographs are only in other folders"):
+        _found(tmp_path, [f"/data/flight1/images/{k}.jpg" for k in range(3)])
+    assert all(path.is_file() for path in _found(tmp_path, [f"/data/flight2/images/{k}.jpg" for k in range(3)]).paths)

@@ -22,6 +22,7 @@ from support.project_reading import check_numbers, read
 from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.formats import realityscan
 from vdgs.captures.formats.brown_lens import brown_intrinsics
+from vdgs.captures.formats.realityscan import RegisteredCamera
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_axes, geodetic_from_enu, is_earth_centered
@@ -325,3 +326,16 @@ def test_skew_and_aspect_of_xmp_are_read_to_their_numbers(tmp_path: Path, flight
     )
     view = read(tmp_path, "realityscan").views[0]
     np.testing.assert_allclose(view.intrinsics.params, bent.params, rtol=1e-9)
+
+
+def test_a_table_in_pixels_is_of_the_photographs_that_were_aligned() -> None:
+    """Photographs may be shrunk evenly; the lens follows where the principal point tells by how much."""
+    camera = RegisteredCamera(
+        name="a.jpg", camera_from_world=np.eye(4), focal_35mm=3650.0, lens={"px": 2747.0, "py": 1815.0}, in_pixels=True
+    )
+    for size in ((5472, 3648), (2736, 1824)):
+        lens = camera.intrinsics(size, Path("cameras.csv"))
+        assert (lens.width, lens.height, lens.focal[0]) == (5472, 3648, 3650.0)
+    for share in (0.8, 1.5):
+        with pytest.raises(CaptureError, match="of another size"):
+            camera.intrinsics((round(5472 * share), round(3648 * share)), Path("cameras.csv"))

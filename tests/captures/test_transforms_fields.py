@@ -19,7 +19,8 @@ from support.captures import (
 from support.dataset_layouts import (
     write_transforms,
 )
-from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix, told_size
+from vdgs.captures.formats.center_sizes import told_size
+from vdgs.captures.formats.json_poses import parse_intrinsics, parse_matrix
 from vdgs.captures.formats.lens_projection import ray_pixels
 from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
@@ -60,7 +61,14 @@ def test_a_lens_without_a_size_is_of_the_size_that_its_principal_point_says(tmp_
         ((331.6025, 265.5355), (640, 512), (640, 512)),
         ((995.3, 746.2), (480, 360), (1920, 1440)),
         ((1016.3, 762.2), (480, 360), (1920, 1440)),
-        ((320.0, 240.0), (480, 360), (480, 360)),  # a crop
+        ((320.0, 240.0), (480, 360), (640, 480)),
+        ((2000.0, 1500.0), (3000, 2250), (4000, 3000)),
+        ((2000.0, 1500.0), (5000, 3750), (4000, 3000)),
+        ((2000.0, 1500.0), (3840, 2880), (4000, 3000)),
+        ((1999.5, 1499.5), (4000, 3000), (4000, 3000)),  # pixels count from the middle of the first
+        ((2747.0, 1815.0), (5472, 3648), (5472, 3648)),
+        ((2747.0, 1815.0), (2736, 1824), (5472, 3648)),
+        ((380.0, 240.0), (640, 480), (640, 480)),  # a part of a photograph
         ((360.0, 270.0), (240, 180), (720, 540)),
         ((990.3, 745.2), (640, 480), (1920, 1440)),
         ((2000.0, 1500.0), (640, 480), (4000, 3000)),  # the middle, whatever the factor
@@ -72,10 +80,13 @@ def test_the_nearest_whole_factor_is_the_size_of_a_lens_off_the_middle(lens, siz
     assert told_size(size, lens, Path("transforms.json"), "a.png", "") == expected
 
 
-def test_a_factor_that_cannot_be_told_is_refused():
-    """15 or 16 times: a principal point between the middles of both."""
+@pytest.mark.parametrize(
+    ("lens", "size"), [((496.3, 372.2), (64, 48)), ((823.2, 619.1), (1280, 960)), ((823.2, 619.1), (2000, 1500))]
+)
+def test_a_factor_that_cannot_be_told_is_refused(lens, size):
+    """15 or 16 times, or a lens off the middle of photographs that were shrunk or enlarged by no whole number."""
     with pytest.raises(CaptureError, match=r"of another size\. Write w"):
-        told_size((64, 48), (496.3, 372.2), Path("transforms.json"), "a.png", "Write w")
+        told_size(size, lens, Path("transforms.json"), "a.png", "Write w")
 
 
 @pytest.mark.parametrize("center", [(0.5, 0.5), (0.497, 0.512), (0.013, -0.008)])

@@ -37,7 +37,7 @@ from vdgs.captures.position_fit import fit_positions, with_likelier_up
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import by_axis, told_up
 from vdgs.captures.tables_beside import position_tables, table_note
-from vdgs.captures.up_axis import HINT, OR_CEILING, estimate_up, up_by_views
+from vdgs.captures.up_axis import HINT, MAX_UP_DEVIATION_DEG, OR_CEILING, contradict_up, estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_centers
@@ -52,8 +52,6 @@ NOMINAL_CAMERA_HEIGHT = 10.0
 FAR_FROM_ORIGIN_M = 1000.0
 #: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
 MAX_ENU_DISTANCE_M = 50_000.0
-#: A told up axis farther than this from the estimated one is worth a warning.
-MAX_UP_DEVIATION_DEG = 30.0
 AXES = {
     sign + name: factor * np.eye(3)[index]
     for index, name in enumerate("xyz")
@@ -128,7 +126,7 @@ def _frame_without_distances(
         if source.georef is not None:
             return _georeferenced(scene, source.georef, source.georef.method, warnings), warnings
     if source.world is not None:
-        frame = _promised(scene, source.world, warnings)
+        frame = _promised(scene, _with_seen_up(scene, source.world, warnings), warnings)
         _compare_up(scene, frame, warnings)
         return frame, warnings
     told = told_up(root)
@@ -363,6 +361,21 @@ def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]
     if not length > 0:
         raise CaptureError("all cameras and points lie in one place; this is no scene. Check the sparse model.")
     return _centered(scene, rotation, NOMINAL_CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
+
+
+def _with_seen_up(scene: _Scene, world: WorldPrior, warnings: list[str]) -> WorldPrior:
+    """The world with the up axis that cameras and points tell, where it has no metres, which a format's own sets have,
+    and they contradict the promised one without a doubt; that is said."""
+    doubts: list[str] = []
+    up, how = estimate_up(scene.centers, scene.rotations, scene.points, doubts)
+    if world.metric or doubts or not contradict_up(scene.rotations, world.rotation[2], up):
+        return world
+    angle = float(np.degrees(np.arccos(np.clip(world.rotation[2] @ up, -1, 1))))
+    warnings.append(
+        f"{world.how}, but cameras and points tell another up, {angle:.0f} degrees away, which is used ({how}). If "
+        "that is wrong, --up z."
+    )
+    return replace(world, rotation=rotation_to_z(up), how=how)
 
 
 def _promised(scene: _Scene, world: WorldPrior, warnings: list[str]) -> GroundFrame:

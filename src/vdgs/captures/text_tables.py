@@ -11,6 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from vdgs.captures.decimal_signs import with_plain_numbers
 from vdgs.captures.table_columns import Row, known_columns
 from vdgs.errors import CaptureError
@@ -31,6 +33,7 @@ _LARGEST = {
     **dict.fromkeys(("across", "upwards", "eastwards", "northwards"), 1000.0),
 }  # fmt: skip
 _MEASURED = {*_LARGEST, "x", "y"}
+_NO_NUMBER = re.compile(r"[+-]?(?:nan|inf)\(.*\)|[+-]?1\.#\w+", re.IGNORECASE)
 #: A photograph's name in front of a line whose words are parted by blanks, which may be in the name too.
 _NAME_WITH_BLANKS = re.compile(
     r"\s*([^\"#][^\"]*?\.(?:jpe?g|png|tiff?|webp|avif|dng|cr[23]|nef|arw|raf|orf|rw2|hei[cf]|hif))\s+(?=\S)",
@@ -111,6 +114,19 @@ def decode_text(data: bytes) -> str:
     """A text in UTF-8, UTF-16 or Windows' Latin, as programs on Windows write it."""
     text = _decode_unicode(data)
     return data.decode("cp1252", errors="replace") if text is None else text
+
+
+def float_or_nan(word: str) -> float:
+    """A number, NaN also as programs write it on Windows: `-nan(ind)`, `-1.#IND`. ValueError for anything else."""
+    return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
+
+
+def parse_numbers(words: Sequence[str]) -> np.ndarray:
+    """Numbers [n] float64, each as by `float_or_nan`. ValueError where one is none."""
+    try:
+        return np.array(words, np.float64)
+    except ValueError:
+        return np.array([*map(float_or_nan, words)])
 
 
 def _decode_unicode(data: bytes) -> str | None:

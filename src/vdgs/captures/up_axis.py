@@ -45,6 +45,8 @@ MIN_DOWN_COSINE = 0.5
 TURNED = 0.75
 #: Standard deviations of up in degrees: by views that look down, by cameras that are held level, where in doubt.
 VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0
+#: A told up axis farther than this from the estimated one is worth a warning.
+MAX_UP_DEVIATION_DEG = 30.0
 #: How up was found where the upper sides of photographs say which way it is.
 UPPER_SIDES = "upper sides of the photographs up"
 #: What may be taken for what where photographs all look one way.
@@ -129,6 +131,18 @@ def _estimate(
     above = float(np.median(centers @ axis) - np.median(points @ axis))
     warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
     return (-axis if above < 0 else axis), f"{how}, cameras above", None
+
+
+def contradict_up(rotations: np.ndarray, told: np.ndarray, up: np.ndarray) -> bool:
+    """Whether cameras with these rotations [n, 3, 3], as for `estimate_up`, contradict an up axis that was told, unit
+    [3], by the one that is estimated without a doubt: they are rolled clearly less about that; or it is far away, they
+    are rolled no more about it, and their upper sides are not down."""
+    views = _views(rotations)
+    ours, theirs = _roll(views.rights, up), _roll(views.rights, told)
+    if theirs > CLEAR_ROLL and ours < MAX_ROLL_RATIO * theirs:
+        return True
+    is_far = float(told @ up) < np.cos(np.radians(MAX_UP_DEVIATION_DEG))
+    return is_far and ours <= max(theirs, CLEAR_ROLL) and float(views.image_up @ up) > -MIN_VIEW_COSINE
 
 
 def _other_up(views: _Views, axis: np.ndarray) -> OtherUp | None:

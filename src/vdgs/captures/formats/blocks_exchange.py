@@ -252,8 +252,10 @@ class _Block:
     def _fisheye(
         self, group: Element, focal: float, center: tuple[float, float], size: tuple[int, int], label: str
     ) -> Intrinsics:
+        """A matrix counts in pixels per quarter turn; a focal length is that of an equidistant lens, per radian."""
         matrix, bends = group.find("FisheyeFocalMatrix"), group.find("FisheyeDistortion")
-        affine, polynomial = [focal, 0.0, 0.0, focal], [0.0, 1.0, 0.0, 0.0, 0.0]
+        quarter = focal * np.pi / 2
+        affine, polynomial = [quarter, 0.0, 0.0, quarter], [0.0, 1.0, 0.0, 0.0, 0.0]
         if matrix is not None:
             affine = [xml_number(matrix, f"M_{at}", self._file, label) for at in ("00", "01", "10", "11")]
         if bends is not None:

@@ -7,14 +7,17 @@ photograph that has no place. The size of the photographs is not in the file.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.photograph_sizes import check_seen_inside, name_unaligned, photograph_sizes
+from vdgs.captures.formats.aligned_sizes import aligned_sizes
+from vdgs.captures.formats.photograph_sizes import name_unaligned
 from vdgs.captures.formats.project import Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.image_suffixes import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
+from vdgs.captures.text_tables import parse_numbers
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
@@ -53,6 +56,7 @@ class BundlerModel:
     seen_point: np.ndarray
     seen_camera: np.ndarray
     seen_px: np.ndarray
+    warnings: tuple[str, ...] = ()
 
 
 def find_files(root: Path) -> list[Path]:
@@ -95,30 +99,31 @@ def read(file: Path, options: CaptureOptions) -> Project:
     views = []
     order = np.argsort(model.seen_camera, kind="stable")
     starts = np.searchsorted(model.seen_camera[order], np.arange(model.num_cameras + 1))
-    sizes = photograph_sizes(root, options, called, file) if called else []
-    for camera, name, size in zip(model.cameras, called, sizes, strict=True):
-        mine = order[starts[camera.number] : starts[camera.number + 1]]
+    own = [order[starts[camera.number] : starts[camera.number + 1]] for camera in model.cameras]
+    seen = [model.seen_px[each] for each in own]
+    sizes, notes = aligned_sizes(root, options, called, seen, file) if own else ([], [])
+    for camera, name, size, mine in zip(model.cameras, called, sizes, own, strict=True):
         shown = model.seen_point[mine], model.seen_px[mine] + np.array(size) / 2
-        check_seen_inside(shown[1], size, file, name)
         lens, pose = camera.intrinsics(size, file), camera.camera_from_world
         views.append(ProjectView(names=(name,), camera_from_world=pose, intrinsics=lens, sightings=shown))
     return Project(
         format="bundler", file=file, views=tuple(views), points=model.points, colors=model.colors,
-        warnings=tuple(name_unaligned(lost)),
+        warnings=(*model.warnings, *name_unaligned(lost), *notes),
     )  # fmt: skip
 
 
 def read_bundle(file: Path) -> BundlerModel:
-    """Raises `CaptureError` for what is no file of Bundler, is cut off, or has counts that it does not keep."""
+    """The model of a file, without points and cameras that are not finite. Raises `CaptureError` for what is no file of
+    Bundler, is cut off, or has counts that it does not keep."""
     try:
         text = file.read_text(encoding="ascii", errors="replace")
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
     try:
-        numbers = np.array(text.partition("\n")[2].split(), dtype=np.float64)
+        numbers = parse_numbers(text.partition("\n")[2].split())
     except ValueError as error:
         raise CaptureError(f"{file}: holds what is no number ({error}). {_AGAIN}") from None
-    if len(numbers) < 2 or not np.isfinite(numbers).all() or not (0 < numbers[0] < 1e7 and 0 <= numbers[1] < 1e9):
+    if len(numbers) < 2 or not (0 < numbers[0] < 1e7 and 0 <= numbers[1] < 1e9):
         raise CaptureError(f"{file}: does not begin with the numbers of cameras and points. {_AGAIN}")
     num_cameras, num_points = int(numbers[0]), int(numbers[1])
     start = 2 + _CAMERA_NUMBERS * num_cameras
@@ -126,19 +131,26 @@ def read_bundle(file: Path) -> BundlerModel:
         raise CaptureError(f"{file}: ends before its {num_cameras} cameras and {num_points} points do. {_AGAIN}")
     cameras = _cameras(numbers[2:start].reshape(-1, _CAMERA_NUMBERS), file)
     points, lists = _points(numbers, start, num_points, file)
-    of_point = np.repeat(np.arange(num_points), [len(each) // _SIGHTING_NUMBERS for each in lists])
+    known = np.isfinite(points).all(axis=1)
+    points, lists = points[known], list(compress(lists, known))
+    of_point = np.repeat(np.arange(len(points)), [len(each) // _SIGHTING_NUMBERS for each in lists])
     seen = np.concatenate([*lists, np.zeros(0)]).reshape(-1, _SIGHTING_NUMBERS)
+    measured = np.isfinite(seen).all(axis=1)
+    of_point, seen = of_point[measured], seen[measured]
     colors = points[:, 3:].clip(0, 255).astype(np.uint8)
+    lost = num_points - len(points)
+    said = f"{file.name}: {lost} of its {num_points} points have coordinates that are not finite, and are left out."
     return BundlerModel(
         num_cameras=num_cameras, cameras=cameras, points=points[:, :3], colors=colors,
         seen_point=of_point, seen_camera=seen[:, 0].astype(np.int64), seen_px=seen[:, 2:] * [1.0, -1.0],
+        warnings=(said,) if lost else (),
     )  # fmt: skip
 
 
 def _cameras(rows: np.ndarray, file: Path) -> tuple[BundlerCamera, ...]:
     found = []
     for number, row in enumerate(rows):
-        if row[0] <= 0:
+        if not (row[0] > 0 and np.isfinite(row).all()):
             continue
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = row[3:12].reshape(3, 3), row[12:]
@@ -154,9 +166,9 @@ def _points(numbers: np.ndarray, start: int, count: int, file: Path) -> tuple[np
         points[index] = numbers[start : start + _POINT_NUMBERS]
         length = numbers[start + _POINT_NUMBERS] if start + _POINT_NUMBERS < len(numbers) else -1
         start += _POINT_NUMBERS + 1
-        end = start + _SIGHTING_NUMBERS * int(max(length, -1))
-        if length < 0 or end > len(numbers):
+        if not 0 <= length <= (len(numbers) - start) / _SIGHTING_NUMBERS:
             raise CaptureError(f"{file}: ends within point {index} of {count}. {_AGAIN}")
+        end = start + _SIGHTING_NUMBERS * int(length)
         lists.append(numbers[start:end])
         start = end
     return points, lists

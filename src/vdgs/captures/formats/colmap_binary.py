@@ -21,6 +21,7 @@ from vdgs.captures.formats.colmap_records import (
     unsupported_model,
 )
 from vdgs.captures.formats.source_capture import CAMERA_MODELS, Intrinsics
+from vdgs.captures.text_tables import decode_text
 from vdgs.errors import CaptureError
 
 MAX_NAME_BYTES = 4096
@@ -70,10 +71,7 @@ class _Cursor:
         if end < 0:
             raise self.fail("an image name does not end")
         raw, self.offset = self.data[self.offset : end], end + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise self.fail(f"an image name is not UTF-8 text ({raw[:40]!r})") from None
+        return decode_text(raw)
 
     def finish(self) -> None:
         if self.left:

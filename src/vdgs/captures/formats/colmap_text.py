@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
 import math
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,22 +19,23 @@ from vdgs.captures.formats.colmap_records import (
     unsupported_model,
 )
 from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics
+from vdgs.captures.text_tables import decode_text, float_or_nan
 from vdgs.errors import CaptureError
 
 #: How far from 1 the length of a quaternion may be, as programs round it.
 _UNIT_TOLERANCE = 1e-3
-_NO_NUMBER = re.compile(r"[+-]?(?:nan|inf)\(.*\)|[+-]?1\.#\w+", re.IGNORECASE)
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without comments."""
-    try:
-        with file.open(encoding="utf-8-sig") as stream:
-            for number, line in enumerate(stream, 1):
-                if not line.lstrip().startswith("#"):
-                    yield number, line.rstrip("\r\n")
-    except UnicodeDecodeError as error:
-        raise CaptureError(f"{file}: is not UTF-8 text ({error}). Export the COLMAP model again.") from None
+    """Numbered lines without comments, each as by `decode_text`: names of photographs may be in Windows' Latin."""
+    with file.open("rb") as stream:
+        wide = stream.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    encoding, errors = ("utf-16", "replace") if wide else ("utf-8-sig", "surrogateescape")
+    with file.open(encoding=encoding, errors=errors) as stream:
+        for number, line in enumerate(stream, 1):
+            if not line.lstrip().startswith("#"):
+                plain = line if wide or line.isascii() else decode_text(line.encode("utf-8", "surrogateescape"))
+                yield number, plain.rstrip("\r\n")
 
 
 def _bad_line(file: Path, number: int, expected: str) -> CaptureError:
@@ -47,11 +48,6 @@ def _whole(word: str) -> int:
     if not number.is_integer():
         raise ValueError(word)
     return int(number)
-
-
-def _number(word: str) -> float:
-    """A number of a pose, NaN also as programs write it on Windows: `-nan(ind)`, `-1.#IND`. ValueError for others."""
-    return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
 
 
 def read_cameras_text(file: Path) -> Cameras:
@@ -84,7 +80,7 @@ def read_images_text(file: Path, with_points: bool = True) -> Iterator[ColmapIma
         words = line.split(maxsplit=9)
         try:
             _, camera = int(words[0]), int(words[8])
-            pose = [_number(word) for word in words[1:8]]
+            pose = [float_or_nan(word) for word in words[1:8]]
             name = words[9].strip()
         except (ValueError, IndexError):
             raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
@@ -105,7 +101,7 @@ def _is_pose(line: str) -> bool:
         return False
     name = words[9].split()
     try:
-        quaternion, _ = [_number(word) for word in words[1:5]], [_number(word) for word in words[5:8]]
+        quaternion, _ = [float_or_nan(word) for word in words[1:5]], [float_or_nan(word) for word in words[5:8]]
         float(name[0])
     except ValueError:
         return True

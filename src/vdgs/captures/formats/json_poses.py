@@ -12,6 +12,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from vdgs.captures.formats.center_sizes import told_size
 from vdgs.captures.formats.lens_keys import (
     FOCAL,
     LENS,
@@ -26,16 +27,14 @@ from vdgs.captures.formats.lens_keys import (
 )
 from vdgs.captures.formats.source_capture import (
     BROWN,
-    CENTERED,
     BadPose,
     Intrinsics,
-    check_centered,
     check_intrinsics,
     safe_name,
     say_of_panoramas,
     to_rigid,
 )
-from vdgs.captures.image_files import read_header, same_aspect
+from vdgs.captures.image_files import read_header
 from vdgs.captures.name_resolution import find_file
 from vdgs.captures.text_tables import read_text
 from vdgs.errors import CaptureError
@@ -177,7 +176,9 @@ def parse_intrinsics(frame: JsonObject, common: JsonObject, image: Path, file: P
     width, height = get("w"), get("h")
     if width is None or height is None:
         header = read_header(image)
-        width, height = told_size((header.width, header.height), (get("cx"), get("cy")), file, image.name, _WRITE_SIZE)
+        width, height = header.width, header.height
+        if (cx := get("cx")) and (cy := get("cy")):
+            width, height = told_size((header.width, header.height), (cx, cy), file, image.name, _WRITE_SIZE)
     fx, fy = _focals(get, (width, height), file, image.name)
     # A corner is no principal point: programs that know none write 0.
     head = (fx, fy, get("cx", width / 2) or width / 2, get("cy", height / 2) or height / 2)
@@ -206,36 +207,7 @@ def _focals(
     return fx, fy
 
 
-def told_size(
-    size: tuple[int, int], center: tuple[float | None, float | None], file: Path, label: str, remedy: str
-) -> tuple[int, int]:
-    """The size that a lens without one is told for, by the photograph's and the principal point: the whole multiple, or
-    part, of whose middle it is; else the size whose middle it is exactly, if that has the shape of the photograph; else
-    the whole multiple whose middle is near it and clearly nearer than that of the next. Raises `CaptureError` where
-    none is."""
-    cx, cy = center
-    if not cx or not cy or all(CENTERED[0] < c / side < CENTERED[1] for c, side in zip((cx, cy), size, strict=True)):
-        return size
-    if cx > 0 and cy > 0:
-        across, down = 2 * cx / size[0], 2 * cy / size[1]
-        off = {many: max(abs(across / many - 1), abs(down / many - 1)) for many in _SHRUNK}
-        nearest, second = sorted(off, key=lambda many: off[many])[:2]
-        whole, doubled = (round(2 * cx), round(2 * cy)), (2 * cx, 2 * cy)
-        is_middle = max(abs(a - b) for a, b in zip(whole, doubled, strict=True)) < _ROUNDED and same_aspect(whole, size)
-        if off[nearest] > _EXACT and (is_middle or (off[nearest] > _MIDDLE and same_aspect(whole, size))):
-            return whole
-        if off[nearest] <= _MIDDLE and off[second] > 2 * off[nearest]:
-            return round(size[0] * nearest), round(size[1] * nearest)
-    check_centered((cx, cy), size, file, label, remedy)
-    return size
-
-
 _WRITE_SIZE = "Write w and h into the file, or give the photographs of that size."
-#: By whole numbers photographs are shrunk, or the file is; principal points lie in the middle, or near it, as a share
-#: of it: those of DTU are 3.7 % off.
-_SHRUNK, _EXACT, _MIDDLE = (1, *range(2, 17), *(1 / many for many in range(2, 17))), 0.01, 0.06
-#: Doubled, the middle of an image is a whole number of pixels, but for what files round.
-_ROUNDED = 1e-3
 #: Camera models that bend by radial and tangential polynomials, if at all, and fisheyes that k1...k4 describe.
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}

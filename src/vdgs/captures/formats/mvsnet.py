@@ -23,13 +23,13 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from vdgs.captures.formats.json_poses import parse_matrix, told_size
+from vdgs.captures.formats.center_sizes import told_size
+from vdgs.captures.formats.json_poses import parse_matrix
 from vdgs.captures.formats.source_capture import (
     BadPose,
     Intrinsics,
     SourceCapture,
     SourceView,
-    check_centered,
     check_intrinsics,
     leave_out_bad_poses,
     one_view_each,
@@ -245,7 +245,6 @@ def _read_view(file: Path, image: Path, told_for: Path) -> SourceView:
     pose = to_rigid(matrix, file, "extrinsic")
     header, center = read_header(told_for), (float(lens[0, 2]), float(lens[1, 2]))
     size = told_size((header.width, header.height), center, file, told_for.name, _OF_THAT_SIZE)
-    check_centered(center, size, file, told_for.name, _OF_THAT_SIZE)
     intrinsics = Intrinsics("PINHOLE", (float(lens[0, 0]), float(lens[1, 1]), *center), *size)
     return SourceView(
         name=image.name, camera_from_world=pose, image_path=image,

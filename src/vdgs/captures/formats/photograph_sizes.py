@@ -7,16 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from vdgs.captures.formats.project_photographs import find_photographs
 from vdgs.captures.formats.source_capture import LEAST_THERE, MAX_MISSING_LISTED, format_list
-from vdgs.captures.image_files import ROUNDING_PX, read_header
+from vdgs.captures.image_files import read_header
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 
-#: Programs that align a photograph see few points beside it: at most this share (choice).
-MAX_OUTSIDE = 0.1
 GIVE_ALIGNED = "Give the photographs that were aligned (--images)."
 
 
@@ -24,28 +20,19 @@ def photograph_sizes(root: Path, options: CaptureOptions, names: Sequence[str], 
     """Width and height of each photograph, for files that do not tell them: those of the photographs as they were taken
     where these are there too, and not of a folder of smaller ones. A photograph that is missing is taken to be as large
     as most. Raises `CaptureError` where none is there."""
-    wanted = [(name,) for name in names]
     try:
-        found = find_photographs(root, replace(options, images=None), wanted, file)
+        return sizes_in_folder(root, replace(options, images=None), names, file)
     except CaptureError:
-        found = find_photographs(root, options, wanted, file)
+        return sizes_in_folder(root, options, names, file)
+
+
+def sizes_in_folder(root: Path, options: CaptureOptions, names: Sequence[str], file: Path) -> list[tuple[int, int]]:
+    """As `photograph_sizes`, of the photographs in the folder that `options` name alone."""
+    found = find_photographs(root, options, [(name,) for name in names], file)
     headers = [read_header(path) if path.is_file() else None for path in found.paths]
     sizes = [(header.width, header.height) if header else None for header in headers]
     usual = Counter(size for size in sizes if size).most_common(1)[0][0]
     return [size or usual for size in sizes]
-
-
-def check_seen_inside(pixels: np.ndarray, size: tuple[int, int], file: Path, name: str) -> None:
-    """Raise `CaptureError` where a photograph is said to show points beside itself, at `pixels` [n, 2] from its corner:
-    it is smaller than the one that was aligned, whose focal length and pixels the file has."""
-    if not len(pixels):
-        return
-    outside = (pixels < -ROUNDING_PX).any(axis=1) | (pixels > np.array(size) + ROUNDING_PX).any(axis=1)
-    if outside.mean() > MAX_OUTSIDE:
-        raise CaptureError(
-            f"{file}: {outside.mean():.0%} of the points that {name} shows lie beside it, for the photograph is "
-            f"{size[0]}x{size[1]}: it is of another size. {GIVE_ALIGNED}"
-        )
 
 
 def leave_out(

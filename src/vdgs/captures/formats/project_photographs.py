@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -20,6 +21,8 @@ from vdgs.system.units import some_names
 #: The folder of undistorted photographs, which are not those of a camera.
 UNDISTORTED = "undistorted"
 _SUFFIXES = IMAGE_SUFFIXES | OTHER_IMAGE_SUFFIXES
+#: What folders of one side of a split are called.
+_SIDES = {"train", "training", "test", "testing", "val", "valid", "validation", "eval"}
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,8 @@ def find_photographs(
 ) -> FoundPhotographs:  # fmt: skip
     """The photographs of cameras, each known by some `names`, below the folder that `options` name, else images/, else
     the whole capture. Of several that a name may mean the one is taken that alone has the camera's width and height,
-    where `sizes` says these.
+    where `sizes` says these; photographs of another folder than the one that is meant are not taken
+    (`_without_others`).
 
     Raises `CaptureError` where none is there, where too many may be any of several, and for photographs that are
     several cameras'.
@@ -47,22 +51,85 @@ def find_photographs(
     folder = image_root(root, options)
     images = images_below(folder, options)
     index = PhotographIndex(images)
-    meant = [index.find_all(each) for each in names]
+    meant, others = _without_others(names, [index.find_all(each) for each in names])
     found = [each[0] if len(each) == 1 else None for each in meant]
     if sizes is not None:
         found = [name or _of_size(each, size, images) for name, each, size in zip(found, meant, sizes, strict=True)]
     unclear = [each for name, each in zip(found, meant, strict=True) if name is None and len(each) > 1]
     alike = [each for each, count in Counter(names).items() if count > 1]
     _refuse_many_unclear(unclear, len(names) - found.count(None), len(names), alike, file)
+    notes = _note_others(others, len(names) - found.count(None), len(names), file)
     if not any(found):
         raise _none_there(names, folder, images, file)
     _refuse_shared(found, alike, file)
     chosen = [name for name, each in zip(found, meant, strict=True) if name is not None and len(each) > 1]
-    notes = _notes_on_several(unclear, chosen, folder)
+    notes += _notes_on_several(unclear, chosen, folder)
     called = [name or _plain(each[0]) for name, each in zip(found, names, strict=True)]
     paths = tuple(images.get(name, folder / name) for name in called)
     relative = folder.relative_to(root) if folder.is_relative_to(root) else folder
     return FoundPhotographs(relative.as_posix(), tuple(called), paths, notes)
+
+
+def _without_others(
+    names: Sequence[tuple[str, ...]], meant: Sequence[list[str]]
+) -> tuple[list[list[str]], list[tuple[str, str]]]:
+    """What each camera may mean without photographs of other folders, and the names of cameras that nothing is left
+    for, each with such a photograph: cards number the photographs of all their folders alike."""
+    tails = {folders[-k:] for each in names for name in each if (folders := _parts(name)[:-1]) for k in _upto(folders)}
+    kept, others = [], []
+    for called, there in zip(names, meant, strict=True):
+        kept.append([each for each in there if not _is_of_other_folder(called, each, tails)])
+        if there and not kept[-1]:
+            others.append((called[0], there[0]))
+    return kept, others
+
+
+def _upto(folders: Sequence[str]) -> range:
+    return range(1, len(folders) + 1)
+
+
+def _is_of_other_folder(called: Sequence[str], found: str, tails: Collection[tuple[str, ...]]) -> bool:
+    """Whether the folders of a photograph that was found are others than all those that the names of a camera tell:
+    such as the project has for other cameras (by the ends of their paths, `tails`), or of the same kind
+    (`is_of_another`)."""
+    there = _parts(found)
+    told = [parts for parts in map(_parts, called) if len(parts) > 1 and _stem(parts[-1]) == _stem(there[-1])]
+    return bool(told) and all(_contradict(meant, there, tails) for meant in told)
+
+
+def _contradict(meant: Sequence[str], there: tuple[str, ...], tails: Collection[tuple[str, ...]]) -> bool:
+    same = _shared_tail(meant, there)
+    if same >= min(len(meant), len(there)) - 1:
+        return False
+    above = ("/".join((*each[: -1 - same], each[-1])) for each in (meant, there))
+    return there[-2 - same : -1] in tails or is_of_another(*above)
+
+
+def is_of_another(written: str, found: str) -> bool:
+    """Whether a photograph is of another folder of the same kind than the one that is meant, by the names of both: the
+    other side of a split (train/ for test/), or another number (flight2/ for flight1/). These have other photographs
+    under the same names; shrunk ones (images_4) are the same."""
+    meant, there = (PurePosixPath(path.replace("\\", "/")).parts[:-1] for path in (written, found))
+    sides = [{side for side in map(str.lower, folders) if side in _SIDES} for folders in (meant, there)]
+    if all(sides) and sides[0] != sides[1]:
+        return True
+    ends = [folders[-1].lower() if folders else "" for folders in (meant, there)]
+    kinds = [re.sub(r"\d+", "#", end) for end in ends]
+    return ends[0] != ends[1] and kinds[0] == kinds[1] and "#" in kinds[0] and not ends[0].startswith("images_")
+
+
+def _note_others(others: Sequence[tuple[str, str]], found: int, count: int, file: Path) -> tuple[str, ...]:
+    """A warning about photographs that only other folders have; CaptureError where too few are left without them."""
+    if not others:
+        return ()
+    said = (
+        f"{len(others)} of its {count} photographs are only in other folders than the project says, such as "
+        f"{_plain(others[0][0])}, for which {others[0][1]} is there: another photograph under the same name, it seems"
+    )
+    hint = "If all were gathered in one folder, give that folder with --images"
+    if found < LEAST_THERE * count <= found + len(others):
+        raise CaptureError(f"{file}: {said}. Copy the right ones there. {hint}.")
+    return (f"{said}. They count as missing. {hint}.",)
 
 
 def _none_there(names: Sequence[tuple[str, ...]], folder: Path, images: dict[str, Path], file: Path) -> CaptureError:

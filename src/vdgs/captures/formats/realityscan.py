@@ -23,10 +23,11 @@ import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, is_in_degrees, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics
+from vdgs.captures.formats.center_sizes import told_size
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, axis_rotation
 from vdgs.captures.formats.photograph_sizes import GIVE_ALIGNED, name_unaligned, photograph_sizes
 from vdgs.captures.formats.project import Project, ProjectView
-from vdgs.captures.formats.source_capture import Intrinsics, check_centered, check_intrinsics, to_rigid
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import read_xml, xml_numbers
 from vdgs.captures.text_tables import decode_text, read_head
 from vdgs.config.capture_options import CaptureOptions
@@ -88,13 +89,13 @@ class RegisteredCamera:
     """Which part of the project it was aligned in, where the file says that."""
 
     def intrinsics(self, size: tuple[int, int], file: Path) -> Intrinsics:
-        """The lens at the size of the photograph."""
+        """The lens at the size of the photograph, or at that which its pixels are told for."""
         (width, height), longer = size, max(size)
         px, py, k1, k2, k3, k4, t1, t2 = (self.lens.get(key, 0.0) for key in _LENS)
         focal, center = self.focal_35mm * longer / 36, (px * longer + width / 2, py * longer + height / 2)
         if self.in_pixels:
             focal, center = self.focal_35mm, (px, py)
-            check_centered(center, size, file, self.name, GIVE_ALIGNED)
+            size = told_size(size, center, file, self.name, GIVE_ALIGNED)
         lens = brown_intrinsics(
             (focal, focal * self.lens.get("aspect", 1.0)), center, size,
             radial=(k1, k2, k3, k4), tangential=(t2, t1), skew=self.lens.get("skew", 0.0) * longer,

@@ -316,18 +316,6 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     return intrinsics
 
 
-def check_centered(center: tuple[float, float], size: tuple[int, int], file: Path, label: str, remedy: str) -> None:
-    """Raise `CaptureError` for a principal point, in pixels from the corner, that is far from the middle of a
-    photograph whose size the file does not say: the lens is told for another size, its focal length too."""
-    (x, y), (width, height) = center, size
-    low, high = CENTERED
-    if not (low < x / width < high and low < y / height < high):
-        raise CaptureError(
-            f"{file}: {label} has its principal point at {x:.0f}, {y:.0f} pixels, and the photograph is "
-            f"{width}x{height}: it is of another size. {remedy}"
-        )
-
-
 def to_rigid(
     matrix: np.ndarray, file: Path, label: str, tolerance: float = ROUNDING_TOLERANCE, *,
     remedy: str = "The file is damaged or of another convention.",

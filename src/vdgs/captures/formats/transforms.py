@@ -7,7 +7,6 @@ world is the original one, so that georeferences hold.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from itertools import starmap
 from pathlib import Path, PurePosixPath
@@ -30,7 +29,7 @@ from vdgs.captures.formats.json_poses import (
 from vdgs.captures.formats.lens_keys import unread_keys
 from vdgs.captures.formats.listed_names import find_listed
 from vdgs.captures.formats.ply_reader import read_point_cloud
-from vdgs.captures.formats.project_photographs import PhotographIndex, images_below
+from vdgs.captures.formats.project_photographs import PhotographIndex, images_below, is_of_another
 from vdgs.captures.formats.source_capture import (
     BadPose,
     SourceCapture,
@@ -58,9 +57,6 @@ TRANSFORMS_FILE = "transforms.json"
 SPLIT_LISTS: tuple[tuple[str, Split], ...] = (
     ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
 )  # fmt: skip
-
-#: What folders of one side of a split are called.
-_SIDES = {"train", "training", "test", "testing", "val", "valid", "validation", "eval"}
 
 #: Where ScanNet++ has the frames that are for testing, beside those that train.
 TEST_FRAMES = "test_frames"
@@ -220,7 +216,7 @@ def _find_photographs(written: list[str], file: Path, root: Path, options: Captu
 def _find_elsewhere(written: list[str], file: Path, root: Path, options: CaptureOptions) -> _Photographs | None:
     """By the ends of paths, in the folder that `--images` names, else by file names in the whole capture, which a note
     says; None where no path means one photograph alone there, or all are of another folder of the kind
-    (`_is_of_another`). Raises `CaptureError` where one may mean several: names that are there twice, such as those of
+    (`is_of_another`). Raises `CaptureError` where one may mean several: names that are there twice, such as those of
     train/ and test/, say nothing of the others either."""
     once = list(dict.fromkeys(written))
     if options.images is not None:
@@ -241,7 +237,7 @@ def _find_elsewhere(written: list[str], file: Path, root: Path, options: Capture
             f"{file}: its photographs are not where it says, and there several times elsewhere: {first!r} may be "
             f"{either[0]} or {either[1]}. Give the folder of the right ones with --images."
         )
-    if not single or len(set(single.values())) < len(single) or any(starmap(_is_of_another, single.items())):
+    if not single or len(set(single.values())) < len(single) or any(starmap(is_of_another, single.items())):
         return None
     first, name = next(iter(single.items()))
     note = f"the photographs are not where {file.name} says, but in other folders: {first} is taken as {name}."
@@ -249,19 +245,6 @@ def _find_elsewhere(written: list[str], file: Path, root: Path, options: Capture
     top = _common_folder(list(single.values()))
     shorts = [name.removeprefix(f"{top}/") for name in names]
     return _Photographs(names, shorts, [there.get(name) for name in names], top, [note])
-
-
-def _is_of_another(written: str, found: str) -> bool:
-    """Whether a photograph is of another folder of the same kind than the one that is meant, by the names of both: the
-    other side of a split (train/ for test/), or another number (flight2/ for flight1/). These have other photographs
-    under the same names; shrunk ones (images_4) are the same."""
-    meant, there = (PurePosixPath(path.replace("\\", "/")).parts[:-1] for path in (written, found))
-    sides = [{side for side in map(str.lower, folders) if side in _SIDES} for folders in (meant, there)]
-    if all(sides) and sides[0] != sides[1]:
-        return True
-    ends = [folders[-1].lower() if folders else "" for folders in (meant, there)]
-    kinds = [re.sub(r"\d+", "#", end) for end in ends]
-    return ends[0] != ends[1] and kinds[0] == kinds[1] and "#" in kinds[0] and not ends[0].startswith("images_")
 
 
 def _common_folder(names: list[str]) -> str:
