@@ -60,6 +60,13 @@ def test_a_shift_by_way_of_a_third_datum_is_found():
     assert np.abs(np.subtract(moved, (11.5, 50.9))).max() > 5e-4
 
 
+def test_a_system_far_from_where_it_is_used_has_the_nearest_operation():
+    """PROJ refuses to list those of ETRS89 about a place in the Atlantic."""
+    found = operation_at(pyproj.CRS("EPSG:4258"), 30.0, -40.0)
+    assert found.made_for.startswith("Europe")
+    assert found.from_geodetic(np.array([[30.0, -40.0, 5.0]]))[0] == pytest.approx([-40, 30, 5], abs=1e-4)
+
+
 def test_of_equal_operations_that_of_the_country_counts():
     """Boxes of Croatia and of Slovakia hold Ljubljana and Olomouc too."""
     slovenia, croatia = (operation_at(pyproj.CRS("EPSG:3912"), *place) for place in ((46.05, 14.5), (44.5, 15.6)))

@@ -61,7 +61,8 @@ def write_project(root: Path, scene: TinyScene, photographs: Path | None = None,
         f'height="{HEIGHT}"/><f>90</f><cx>1</cx><cy>-0.5</cy><b1>0.5</b1><b2>0.3</b2><k1>-0.06</k1><k2>0.01</k2>'
         "<k3>-0.01</k3><k4>0.01</k4><p1>-0.002</p1><p2>0.001</p2></calibration></sensor>"
     )
-    placed = f"<transform><rotation>{words(axes)}</rotation><translation>{words(origin)}</translation></transform>"
+    placed = f"<transform><rotation>{words(axes)}</rotation><translation>{words(origin)}</translation>"
+    placed += "<scale>1</scale></transform>"
     xml = metashape_xml(true_flight(), sensors=sensor, cameras="".join(cameras), transform=placed, reference=reference)
     (root / "cameras.xml").write_text(xml, encoding="utf-8")
     write_ply(root / "points.ply", scene.points, scene.colors)

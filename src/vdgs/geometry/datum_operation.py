@@ -116,6 +116,7 @@ def _operations(
     """What PROJ has from WGS 84 to a system, and what it would have with grids that are not at hand: for the whole
     system, or about a place."""
     from pyproj.aoi import AreaOfInterest
+    from pyproj.exceptions import ProjError
     from pyproj.transformer import TransformerGroup
 
     area: Any = None
@@ -129,6 +130,8 @@ def _operations(
             group = TransformerGroup(_WGS84, crs, always_xy=not own_axes, area_of_interest=area)
         except IndexError:  # pyproj, where PROJ knows a projection but not how to compute it
             raise NoOperation(f"PROJ cannot compute coordinates of {crs.name}") from None
+        except ProjError:  # PROJ, of places far from where a system is used (ETRS89 outside of Europe)
+            return (), ()
     return tuple(group.transformers), tuple(group.unavailable_operations)
 
 

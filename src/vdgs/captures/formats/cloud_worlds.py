@@ -23,6 +23,10 @@ PARTS, VIEWS_LOOKED_AT, POINTS_IN_PARTS = 4, 40, 50_000
 #: A cloud is in other coordinates than it should be where it covers so many times more of the photographs there
 #: (choice), and of another place where it covers less of them than this, and `LEAST_SEEN` is not met.
 BETTER, LEAST_COVERED = 2.0, 0.1
+#: Of coordinates that are tried in order, later ones are taken where they fit so many times better (choice).
+LATER_BETTER = 1.05
+#: Points whose spread across their longest line is less than this share of their distance are at one spot (choice).
+ONE_SPOT, FEWEST_IN_SPOT = 0.01, 10
 #: Fewer points cover too little to tell by that alone: they stay where photographs see them (choice).
 ENOUGH_POINTS = 50
 
@@ -90,6 +94,41 @@ def in_world_of(
             f"OpenGL's axes, camera-from-world in place of world-from-camera). {remedy}"
         )
     return points
+
+
+def best_frame(points: np.ndarray, eyes: Sequence[Eye], frames: Sequence[CloudFrame]) -> tuple[CloudFrame, float]:
+    """The one of some frames (the likeliest first, at least one) that points [n, 3] are in, and the share of the points
+    that photographs show there; 0 where they are in none.
+
+    A cloud that a wrong frame shrinks falls into photographs as a whole, and one that it blows up fills photographs as
+    a whole: only in the right one does it do both. A frame that refuses the points (`CaptureError`) is not theirs.
+    """
+    looked_at = sample_points(points, POINTS_IN_PARTS)
+    best, best_seen, best_fit = frames[0], 0.0, 0.0
+    for frame in frames:
+        try:
+            with np.errstate(all="ignore"):
+                moved = frame[1](looked_at)
+                seen = 0.0 if _is_one_spot(moved, eyes) else share_seen(sample_points(moved, POINTS_LOOKED_AT), eyes)
+                fit = seen * share_covered(moved, eyes) if seen else 0.0
+        except CaptureError:
+            continue
+        if fit > LATER_BETTER * best_fit:
+            best, best_seen, best_fit = frame, seen, fit
+    return best, best_seen
+
+
+def _is_one_spot(points: np.ndarray, eyes: Sequence[Eye]) -> bool:
+    """Whether cameras have points [n, 3] at one spot, or on one line, as degrees are that are taken for metres."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < FEWEST_IN_SPOT:
+        return False
+    middle = np.median(points, axis=0)
+    centers = np.stack([camera_center(eye.camera_from_world) for eye in eyes])
+    away = np.linalg.norm(points - middle, axis=1)
+    near = points[away <= 3 * np.median(away)] - middle
+    spread = np.sqrt(np.linalg.eigvalsh(near.T @ near / len(near)).clip(min=0))  # ascending
+    return bool(spread[1] < ONE_SPOT * np.linalg.norm(centers - middle, axis=1).min())
 
 
 def _farthest(eyes: Sequence[Eye]) -> float:

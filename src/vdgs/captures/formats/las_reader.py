@@ -26,6 +26,19 @@ def find_las(folders: Iterable[Path]) -> Path | None:
     return next((files[0] for files in listed if len(files) == 1), None)
 
 
+def las_system(file: Path) -> str | None:
+    """The coordinate system that the header of a LAS or LAZ file names, as WKT; None where it names none that is
+    known."""
+    import laspy
+
+    try:
+        with laspy.open(file) as reader:
+            system = reader.header.parse_crs()
+    except Exception:  # laspy, its decoders and pyproj raise of many kinds; `read_las_points` says which of the file
+        return None
+    return None if system is None else str(system.to_wkt())
+
+
 def read_las_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64, at most about `MAX_POINTS`, and colors [n, 3] uint8, mid-gray where the file has none.
     Raises `CaptureError` for what is no such file, or is cut off."""

@@ -9,11 +9,10 @@ depth maps is not used, and markers are only compared with the poses.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -21,6 +20,7 @@ import numpy as np
 
 from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, geocentric_to_geodetic, to_geodetic
 from vdgs.captures.formats.brown_lens import brown_intrinsics, fisheye_intrinsics
+from vdgs.captures.formats.camera_bands import color_cameras
 from vdgs.captures.formats.metashape_markers import marker_note
 from vdgs.captures.formats.metashape_project import (
     ALIGNED,
@@ -30,6 +30,7 @@ from vdgs.captures.formats.metashape_project import (
     is_aligned,
     read_chunks,
 )
+from vdgs.captures.formats.metashape_transforms import ChunkTransforms, is_on_globe
 from vdgs.captures.formats.project import CloudFrame, Project, ProjectView
 from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics, to_rigid
 from vdgs.captures.formats.xml_documents import files_ending, holds, read_xml, root_element, xml_number, xml_numbers
@@ -37,7 +38,6 @@ from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_center
-from vdgs.geometry.geodesy import SEMI_MAJOR_M
 from vdgs.geometry.similarity import Similarity
 
 #: Kinds of lenses that are read, by `type` of a sensor or its calibration.
@@ -45,12 +45,6 @@ _PERSPECTIVE, _EQUISOLID = "frame", "equisolid_fisheye"
 _FISHEYES = ("fisheye", "equidistant_fisheye", _EQUISOLID)
 #: Parts of an export that no reader needs, dropped as they come: they may be long.
 _UNUSED = ("shapes", "region", "depth_maps_sets")
-#: A chunk without a coordinate system whose origin is so far from that of its transform is on the globe (metres).
-_ON_GLOBE_M = (SEMI_MAJOR_M - 60_000, SEMI_MAJOR_M + 60_000)
-#: The unit of a local coordinate system and the metres in one.
-_UNIT = re.compile(r"\bUNIT\[\s*\"([^\"]+)\"\s*,\s*(\d*\.?\d+(?:[eE][+-]?\d+)?)\s*[,\]]")
-#: Cameras and their references spread alike up to so much (logarithm of the ratio; choice).
-SAME_SIZE = 0.2
 _FALSE = ("0", "false")
 #: Why cameras are left out, in the order in which they are named.
 _UNALIGNED, _OTHER_BANDS, _NO_OFFSET, _DISABLED = _LEFT_OUT = (
@@ -68,10 +62,19 @@ def is_file(file: Path) -> bool:
 
 
 def find_files(root: Path) -> list[Path]:
-    """The exports of aligned cameras in a folder (those of markers and of references hold none); else the projects."""
-    files = [*filter(is_file, files_ending(root, ".xml", *PROJECTS))]
-    exports = [file for file in files if file.suffix.lower() == ".xml" and holds(file, *ALIGNED)]
-    return exports or [file for file in files if file.suffix.lower() in PROJECTS and is_aligned(file)]
+    """The whole project of aligned photographs in a folder, which has tie points; else the exports of aligned cameras;
+    of several projects without any, all."""
+    projects = _projects_in(root)
+    return projects if len(projects) == 1 else _exports_in(root) or projects
+
+
+def _projects_in(folder: Path) -> list[Path]:
+    return [file for file in files_ending(folder, *PROJECTS) if is_file(file) and is_aligned(file)]
+
+
+def _exports_in(folder: Path) -> list[Path]:
+    """Exports of cameras; those of markers and of references hold none that are aligned."""
+    return [file for file in files_ending(folder, ".xml") if is_file(file) and holds(file, *ALIGNED)]
 
 
 def read(file: Path, options: CaptureOptions) -> Project:
@@ -95,8 +98,18 @@ def read(file: Path, options: CaptureOptions) -> Project:
             f"{file}: {len(active)} chunks have cameras ({_labels(active)}). Merge them, or export one alone."
         )
     others = [chunk for chunk in enabled if chunk is not active[0]]
-    note = [f"the active chunk {_labels(active)} is read; {_labels(others)} is not."] if others else []
-    return _Chunk(active[0], file, note).project()
+    notes = [f"the active chunk {_labels(active)} is read; {_labels(others)} is not."] if others else []
+    if file.suffix.lower() in PROJECTS:
+        unread = _exports_in(file.parent)
+        notes += [f"of {file.name} and {_names(unread)} beside it the project is read."] if unread else []
+        return _Chunk(active[0], file, notes).project()
+    unread = _projects_in(file.parent)
+    notes += [f"{file.name} is read, not {_names(unread)} beside it, which may be newer."] if unread else []
+    return replace(_Chunk(active[0], file, notes).project(), with_points=tuple(unread))
+
+
+def _names(files: Sequence[Path]) -> str:
+    return ", ".join(file.name for file in files)
 
 
 def _labels(chunks: Sequence[StoredChunk]) -> str:
@@ -140,10 +153,11 @@ class _Chunk:
     def __init__(self, stored: StoredChunk, file: Path, warnings: list[str]) -> None:
         self._element, self._file, self._stored, self._warnings = stored.element, file, stored, warnings
         self._sensors = {sensor.get("id", ""): sensor for sensor in self._element.iter("sensor")}
-        self._unknown = ""
+        self._unknown, self._transforms = "", ChunkTransforms(stored.element, file)
+        warnings += self._transforms.warnings
 
     def project(self) -> Project:
-        cameras, place = self._placed(self._used(self._cameras()))
+        cameras, place, is_metric = self._placed(self._used(self._cameras()))
         lenses = self._lenses({camera.sensor for camera in cameras})
         ties = self._stored.tie_points()
         refused: dict[str, list[str]] = {}
@@ -154,20 +168,22 @@ class _Chunk:
             try:
                 if isinstance(lens, str):
                     raise CaptureError(lens)
-                pose = self._pose(camera, self._transforms.get(self._component(camera)))
+                pose = self._pose(camera, self._transform_of(camera))
             except CaptureError as error:
                 refused.setdefault(_why(error, self._file), []).append(camera.label)
                 continue
             shown = ties.shown.get(camera.element.get("id", ""))
             views.append(ProjectView(names=camera.names, intrinsics=lens, camera_from_world=pose, sightings=shown))
             by_number[camera.element.get("id", "")] = views[-1]
-        geodetic, words, frames = self._system(place) if place is not None else (None, "", ())
+        geodetic, words, frames = (
+            self._system(place, views) if is_metric else (None, "", (("of the chunk", place.apply),))
+        )
         markers, marks = self._element.iterfind("markers//marker"), self._stored.marks
-        self._warnings += marker_note(markers, marks, by_number, self._wkt, geodetic, self._file)
+        self._warnings += marker_note(markers, marks, by_number, self._transforms.wkt, geodetic, self._file)
         return Project(
             format="metashape", file=self._file, views=tuple(views), colors=ties.colors,
-            points=ties.points if place is None else place.apply(ties.points), to_geodetic=geodetic,
-            is_metric=place is not None, place=words, cloud_frames=frames, warnings=tuple(self._warnings),
+            points=place.apply(ties.points), to_geodetic=geodetic,
+            is_metric=is_metric, place=words, cloud_frames=frames, warnings=tuple(self._warnings),
             refused=refused, unknown_system=self._unknown,
         )  # fmt: skip
 
@@ -195,7 +211,7 @@ class _Chunk:
         ]
 
     def _used(self, cameras: list[_Camera]) -> list[_Camera]:
-        """Cameras that are aligned and enabled; the others are named."""
+        """Cameras that are aligned, enabled and in color; the others are named."""
         kinds: dict[str, list[_Camera]] = {why: [] for why in ("", *_LEFT_OUT)}
         for camera in cameras:
             kinds[self._why_left_out(camera)].append(camera)
@@ -203,7 +219,13 @@ class _Chunk:
             if some := kinds[why]:
                 names = ", ".join(camera.label for camera in some)
                 self._warnings.append(f"{len(some)} cameras {why} and are left out ({names}).")
-        return kinds[""]
+        in_color, warnings = color_cameras([(camera.label, self._bands(camera)) for camera in kinds[""]])
+        self._warnings += warnings
+        return list(compress(kinds[""], in_color))
+
+    def _bands(self, camera: _Camera) -> tuple[str, ...]:
+        sensor = self._sensors.get(camera.sensor)
+        return () if sensor is None else tuple(band.get("label") or "" for band in sensor.iterfind("bands/band"))
 
     def _why_left_out(self, camera: _Camera) -> str:
         """One of `_LEFT_OUT`, or nothing for a camera that is used."""
@@ -219,11 +241,7 @@ class _Chunk:
     def _shows_what_its_master_does(self, camera: _Camera) -> bool:
         """Not so for the bands of a multispectral camera, which are no photographs of the scene as people see it."""
         assert camera.master is not None
-        own, masters = (
-            [band.get("label") for sensor in (self._sensors.get(each.sensor),) if sensor is not None
-             for band in sensor.iterfind("bands/band")]
-            for each in (camera, camera.master)
-        )  # fmt: skip
+        own, masters = self._bands(camera), self._bands(camera.master)
         return not own or not masters or own == masters
 
     def _offset(self, camera: _Camera) -> tuple[str, str] | None:
@@ -232,11 +250,10 @@ class _Chunk:
         found = [sensor.findtext(name) if sensor is not None else None for name in ("rotation", "location")]
         return (found[0], found[1]) if found[0] and found[1] else None
 
-    def _pose(self, camera: _Camera, chunk: Similarity | None) -> np.ndarray:
+    def _pose(self, camera: _Camera, chunk: Similarity) -> np.ndarray:
         pose = self._camera_to_chunk(camera)
-        if chunk is not None:
-            pose[:3, 3] = chunk.apply(pose[:3, 3])
-            pose[:3, :3] = chunk.rotation @ pose[:3, :3]
+        pose[:3, 3] = chunk.apply(pose[:3, 3])
+        pose[:3, :3] = chunk.rotation @ pose[:3, :3]
         inverse = np.eye(4)
         inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, camera_center(pose)
         return inverse
@@ -324,75 +341,28 @@ class _Chunk:
 
     # --------------------------------------------------------------------------------------------- place
 
-    @cached_property
-    def _transforms(self) -> dict[str, Similarity]:
-        """From each component to the world, in metres, and from the chunk ("") in files of versions that know no
-        components."""
-        found = {}
-        for component in [*self._element.iter("component"), self._element]:
-            transform = component.find("transform")
-            if transform is not None:
-                found[component.get("id", "") if component is not self._element else ""] = self._similarity(transform)
-        meters = self._meters_per_unit(found)
-        return {
-            key: Similarity(meters * each.scale, each.rotation, meters * each.translation)
-            for key, each in found.items()
-        }
-
-    def _meters_per_unit(self, transforms: Mapping[str, Similarity]) -> float:
-        """What the transforms count in where local coordinates are of another unit than metres: metres as everywhere
-        in Metashape, unless the cameras' references, which are in the unit, say that they count in it, too."""
-        unit = _UNIT.search(self._wkt) if is_local_system(self._wkt) else None
-        meters = float(unit[2]) if unit is not None else 1.0
-        if unit is None or not meters > 0 or abs(meters - 1) < 1e-3:
-            return 1.0
-        places, references = self._places_and_references(transforms)
-        spread = [float(np.sqrt(np.var(each, axis=0).sum())) if len(each) > 2 else 0.0 for each in (places, references)]
-        ratio = spread[1] / spread[0] if min(spread) > 0 else 0.0
-        counts_in_unit = bool(ratio) and abs(np.log(ratio)) < SAME_SIZE
-        shown = counts_in_unit or (bool(ratio) and abs(np.log(ratio * meters)) < SAME_SIZE)
-        why = "as the references of its cameras show" if shown else "which nothing in the file shows"
-        taken = unit[1] if counts_in_unit else "metres"
-        self._warnings.append(f"its local coordinates are in {unit[1]}; its poses are taken as {taken}, {why}.")
-        return meters if counts_in_unit else 1.0
-
-    def _places_and_references(
-        self, transforms: Mapping[str, Similarity]
-    ) -> tuple[list[np.ndarray], list[list[float]]]:
-        """Where cameras are by their poses, and by their references, of those that have both."""
-        places, references = [], []
-        for camera in self._element.iter("camera"):
-            pose, reference = camera.find("transform"), camera.find("reference")
-            number = camera.get("component_id", "")
-            key = number if number in transforms else next(iter(transforms), "")
-            words = [reference.get(axis, "") for axis in "xyz"] if reference is not None else []
-            if pose is not None and key in transforms and words and all(words):
-                label = f"camera {camera.get('label', '?')!r}"
-                matrix = xml_numbers(pose.text, 16, self._file, f"the transform of {label}")
-                places.append(transforms[key].apply(np.array(matrix[3:12:4])))
-                references.append(xml_numbers(" ".join(words), 3, self._file, f"the reference of {label}"))
-        return places, references
-
-    @property
-    def _wkt(self) -> str:
-        """The coordinate system of the chunk; empty where it names none."""
-        reference = next((each for each in self._element.findall("reference") if (each.text or "").strip()), None)
-        return (reference.text or "").strip() if reference is not None else ""
-
-    def _component(self, camera: _Camera) -> str:
+    def _component(self, camera: _Camera, transforms: Mapping[str, Similarity]) -> str:
         number = camera.component
-        if not number and "" not in self._transforms and len(self._transforms) == 1:
-            return next(iter(self._transforms))  # older files have one component, which cameras do not name
-        return number if number in self._transforms else ""
+        if not number and "" not in transforms and len(transforms) == 1:
+            return next(iter(transforms))  # older files have one component, which cameras do not name
+        return number if number in transforms else ""
 
-    def _placed(self, cameras: list[_Camera]) -> tuple[list[_Camera], Similarity | None]:
-        """Cameras of one world, those of most cameras where components hold together by nothing, and what leads from
-        it to metres, None where nothing does."""
+    def _transform_of(self, camera: _Camera) -> Similarity:
+        """What leads on from the component of a camera; nothing where the file has no transform of it."""
+        for transforms in (self._transforms.metric, self._transforms.turns):
+            if (found := transforms.get(self._component(camera, transforms))) is not None:
+                return found
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+    def _placed(self, cameras: list[_Camera]) -> tuple[list[_Camera], Similarity, bool]:
+        """Cameras of one world, those of most cameras where components hold together by nothing, what leads from it on,
+        and whether that is to metres."""
         if not cameras:
-            return [], None
+            return [], Similarity(1.0, np.eye(3), np.zeros(3)), False
+        metric = self._transforms.metric
         components = Counter(camera.component for camera in cameras)
         largest = max(components, key=lambda number: components[number])
-        placed = [camera for camera in cameras if self._component(camera) in self._transforms]
+        placed = [camera for camera in cameras if self._component(camera, metric) in metric]
         if len(components) > 1:
             kept = placed or [camera for camera in cameras if camera.component == largest]
             known = set(kept)
@@ -403,29 +373,15 @@ class _Chunk:
                     f"({', '.join(lost)})."
                 )
             cameras = kept
-        return cameras, self._transforms[self._component(cameras[0])] if placed else None
+        return cameras, self._transform_of(cameras[0]), bool(placed)
 
-    def _similarity(self, transform: Element) -> Similarity:
-        label = "the transform of the chunk"
-        if transform.find("rotation") is None and (transform.text or "").strip():
-            matrix = np.array(xml_numbers(transform.text, 16, self._file, label)).reshape(4, 4)
-            scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-            rotation, translation = matrix[:3, :3] / (scale or 1.0), matrix[:3, 3]
-        else:
-            texts = {name: transform.findtext(name) for name in ("rotation", "translation", "scale")}
-            rotation = np.array(xml_numbers(texts["rotation"] or "1 0 0 0 1 0 0 0 1", 9, self._file, label))
-            translation = np.array(xml_numbers(texts["translation"] or "0 0 0", 3, self._file, label))
-            scale = xml_numbers(texts["scale"] or "1", 1, self._file, label)[0]
-        if not 1e-12 < scale < 1e12:
-            raise CaptureError(f"{self._file}: {label} has the scale {scale}. The file is damaged; export it again.")
-        rigid = to_rigid(np.column_stack([rotation.reshape(3, 3), np.zeros(3)]), self._file, label)
-        return Similarity(scale, rigid[:3, :3], translation)
-
-    def _system(self, chunk: Similarity) -> tuple[ToGeodetic | None, str, tuple[CloudFrame, ...]]:
+    def _system(
+        self, chunk: Similarity, views: Sequence[ProjectView]
+    ) -> tuple[ToGeodetic | None, str, tuple[CloudFrame, ...]]:
         """What brings the world to latitude, longitude and height, how that is called, and what a point cloud beside
         the export may be in."""
-        wkt = self._wkt
-        on_globe = _ON_GLOBE_M[0] < float(np.linalg.norm(chunk.translation)) < _ON_GLOBE_M[1]
+        wkt, centers = self._transforms.wkt, [camera_center(view.camera_from_world) for view in views]
+        on_globe = any(map(is_on_globe, (chunk.translation, *centers)))
         if (not wkt and not on_globe) or is_local_system(wkt):
             return None, "Metashape, local coordinates", (("of the chunk", chunk.apply),)
         if not wkt:
@@ -445,6 +401,12 @@ class _Chunk:
             geodetic = geocentric_to_geodetic("EPSG:4326", self._file)
             frame: CloudFrame = ("of the chunk", lambda points: geodetic(chunk.apply(points)))
             return geodetic, "Metashape, Earth-centred metres, taken for those of WGS 84", (frame,)
+        if not on_globe:
+            self._warnings.append(
+                f"its transform leads to no place on Earth, though the chunk is of {name}: the scene has metres and no "
+                "place; --gps TABLE gives one, or references in Metashape, Update Transform, and another export."
+            )
+            return None, "Metashape, no place on Earth", (("of the chunk", chunk.apply),)
         frames: list[CloudFrame] = [("of the chunk", lambda points: geodetic(chunk.apply(points)))]
         if crs is not None:
             frames.append((f"of {name}", crs))

@@ -25,6 +25,8 @@ PROJECTS = (".psx", ".psz")
 MAX_BYTES = 1 << 31
 #: What an export of the cameras, and a chunk, holds where photographs are aligned.
 ALIGNED = (b"<camera ", b"<transform>")
+#: Lists the chunks, in the folder of a .psx.
+_LIST = "project.zip"
 _REMEDY = "Copy it again, or export the cameras (File > Export > Export Cameras, Agisoft XML)."
 
 
@@ -54,7 +56,8 @@ def is_aligned(file: Path) -> bool:
     """Whether a project has all that is read of it, and photographs that are aligned."""
     if file.suffix.lower() == ".psz":
         return holds(file, *ALIGNED)
-    return any(holds(chunk, *ALIGNED) for chunk in _folder(file).glob("*/chunk.zip"))
+    folder = _folder(file)
+    return (folder / _LIST).is_file() and any(holds(chunk, *ALIGNED) for chunk in folder.glob("*/chunk.zip"))
 
 
 def read_chunks(file: Path) -> list[StoredChunk]:
@@ -66,12 +69,12 @@ def read_chunks(file: Path) -> list[StoredChunk]:
             _stored(chunk, chunk.get("id") == active, chunk.find("frames/frame"), file) for chunk in root.iter("chunk")
         ]
     folder = _folder(file)
-    if not (folder / "project.zip").is_file():
+    if not (folder / _LIST).is_file():
         raise CaptureError(
             f"{file}: is only a pointer to {folder.name}, which is not beside it whole. Copy that folder there too, or "
             "export the cameras (File > Export > Export Cameras, Agisoft XML)."
         )
-    document, found = read_xml(folder / "project.zip"), []
+    document, found = read_xml(folder / _LIST), []
     active = _active(document)
     for listed in document.iter("chunk"):
         zipped = folder / _inside(listed.get("path") or f"{listed.get('id')}/chunk.zip", file)

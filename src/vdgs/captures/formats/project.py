@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.capture import Observations
-from vdgs.captures.coordinate_systems import ToGeodetic
-from vdgs.captures.formats.cloud_worlds import LEAST_SEEN, POINTS_LOOKED_AT, CloudFrame, Eye, share_seen
+from vdgs.captures.coordinate_systems import ToGeodetic, UnknownSystem, to_geodetic, unit_without_heights
+from vdgs.captures.formats.cloud_worlds import LEAST_SEEN, CloudFrame, Eye, best_frame
 from vdgs.captures.formats.colmap_records import sample_observations
-from vdgs.captures.formats.las_reader import can_read_las, find_las, read_las_points
+from vdgs.captures.formats.las_reader import can_read_las, find_las, las_system, read_las_points
 from vdgs.captures.formats.lens_projection import pixel_rays
 from vdgs.captures.formats.photograph_sizes import leave_out
 from vdgs.captures.formats.ply_reader import read_point_cloud
@@ -26,11 +26,11 @@ from vdgs.captures.formats.project_photographs import find_photographs
 from vdgs.captures.formats.source_capture import Intrinsics, NoTiePoints, SourceCapture, SourceView, points_command
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.georeference import Georef
+from vdgs.captures.system_names import is_local_system
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_centers
 from vdgs.geometry.geodesy import enu_from_geodetic, median_place
-from vdgs.geometry.similarity import sample_points
 
 #: Where ODM and PIX4Dmapper put their dense clouds.
 _DENSE = ("odm_georeferencing", "*/2_densification/point_cloud", "2_densification/point_cloud")
@@ -74,6 +74,8 @@ class Project:
     """Why some of its cameras cannot be used, and what these are called."""
     unknown_system: str = ""
     """The coordinate system that it names and that nobody knows; its coordinates are metres then."""
+    with_points: tuple[Path, ...] = ()
+    """Other files of the program, beside its own, that have points."""
     remedy: str = "Export undistorted photographs with them as a COLMAP model instead"
 
 
@@ -220,7 +222,9 @@ def _cloud_beside(
         cloud = las
     cloud = cloud or find_point_cloud(*dense, lone=True)
     if cloud is None:
-        more = f" {las} is not read: it needs pip install 'vdgs[geo]'." if las is not None else ""
+        named = ", ".join(str(file) for file in project.with_points)
+        more = f" Or give the project itself, which has tie points: {named}." if named else ""
+        more += f" {las} is not read: it needs pip install 'vdgs[geo]'." if las is not None else ""
         if several := sorted(
             {each.name for folder in (root, project.file.parent, *dense) for each in folder.glob("*.ply")}
         ):
@@ -230,24 +234,39 @@ def _cloud_beside(
             f"poses as they are: {find_points}\nOr put a point cloud in the same coordinates beside it, as a PLY, LAS "
             f"or LAZ file.{more}"
         )
-    points, colors = (read_point_cloud if cloud.suffix.lower() == ".ply" else read_las_points)(cloud)
-    frames: list[CloudFrame] = [("of the project", world.moved)]
+    is_ply = cloud.suffix.lower() == ".ply"
+    points, colors = (read_point_cloud if is_ply else read_las_points)(cloud)
+    frames: list[CloudFrame] = [] if is_ply else _own_frames(cloud, world)
+    frames.append(("of the project", world.moved))
     frames += [(name, _after(change, world)) for name, change in project.cloud_frames]
     frames.append(("of the scene", lambda points: points))
     eyes = [Eye(pose, view.intrinsics) for pose, view in zip(poses, project.views, strict=True)]
-    best, seen, what = points, -1.0, ""
-    for name, change in frames:
-        with np.errstate(all="ignore"):
-            share = share_seen(change(sample_points(points, POINTS_LOOKED_AT)), eyes)
-        if share > seen:
-            best, seen, what = change(points), share, name
+    (what, change), seen = best_frame(points, eyes, frames)
     if seen < LEAST_SEEN:
         raise NoTiePoints(
             f"{cloud}: its points are not where the cameras of {project.file.name} look ({seen:.0%} fall into "
             "photographs, at best): it is in other coordinates, or of another project. Export it in the project's own, "
             f"or move it away and find points anew: {find_points}"
         )
-    return best, colors, f"the project has no points; those of {cloud.name} are used (coordinates {what})."
+    with np.errstate(all="ignore"):
+        moved = change(points)
+    return moved, colors, f"the project has no points; those of {cloud.name} are used (coordinates {what})."
+
+
+def _own_frames(las: Path, world: _World) -> list[CloudFrame]:
+    """The coordinates that the header of a LAS or LAZ file names, where the world has a place on Earth. Of systems in
+    feet that say nothing of heights, these are in feet or in metres."""
+    if world.georef is None or world.georef.origin is None:
+        return []
+    system = las_system(las)
+    if system is None or is_local_system(system):
+        return []
+    try:
+        ways = [False] if unit_without_heights(system) == 1 else [True, False]
+        found = [to_geodetic(system, las, "its header", heights_as_xy=way) for way in ways]
+    except UnknownSystem:
+        return []
+    return [(f"of {name}", _after(change, world)) for change, name in found]
 
 
 def _after(change: Callable[[np.ndarray], np.ndarray], world: _World) -> Callable[[np.ndarray], np.ndarray]:
