@@ -183,6 +183,7 @@ def test_dates_with_other_signs_are_those_of_exif(moment):
     assert exif_form(moment)[:19] == plain
     assert time_of(moment) == time_of(plain) is not None
     assert first_and_last([moment]) == first_and_last([plain]) == ("2026-06-23 16:31",) * 2
+    assert [exif_form(never) for never in ("0000:00:00 00:00:00", "    :  :     :  :  ", "0000-00-00")] == [""] * 3
     assert (exif_form("a day"), time_of("2026-13-01 10:00:00")) == ("a day", None)
 
 

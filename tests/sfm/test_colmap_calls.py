@@ -22,7 +22,14 @@ def test_a_call_in_memory_that_fails_is_explained():
 
 
 @pytest.mark.parametrize(
-    ("said", "explained"), [("bad pairs", "COLMAP could not go on"), ("database or disk is full", "the disk is full")]
+    ("said", "explained"),
+    [
+        ("bad pairs", "COLMAP could not go on"),
+        ("image was not successfully registered", "COLMAP could not go on"),
+        ("matrix is not of full rank", "COLMAP could not go on"),
+        ("database or disk is full", "the disk is full"),
+        ("write: No space left on device", "the disk is full"),
+    ],
 )
 def test_a_call_with_a_database_names_its_folder(tmp_path, said, explained):
     with pytest.raises(VdgsError, match=explained) as refused:

@@ -17,7 +17,7 @@ from vdgs.captures.up_axis import VIEWS_DEG, up_by_views
 from vdgs.sfm.flights import altitude_offsets
 from vdgs.sfm.georegistration import _checked_on_a_line, accuracy_of
 from vdgs.sfm.gps_priors import GpsPriors
-from vdgs.sfm.image_metadata import attitude_from_gimbal
+from vdgs.sfm.image_metadata import attitude_from_gimbal, likeliest_attitude, read_attitudes
 from vdgs.sfm.recorded_headings import checked_by_headings
 
 pytestmark = pytest.mark.slow
@@ -181,6 +181,22 @@ def orbit() -> tuple[np.ndarray, np.ndarray]:
     yaws = 18.0 * np.arange(20)
     around = np.radians(yaws + 180)
     return np.stack([32 * np.sin(around), 32 * np.cos(around), 20 + 0.5 * (np.arange(20) % 3)], axis=1), yaws
+
+
+def test_views_that_look_down_without_a_heading_say_nothing_of_north():
+    """Of a camera that records its pitch alone, flown southwards."""
+    south = attitude_from_gimbal(180.0, -90.0, 0.0).camera_from_enu
+    pose = SimpleNamespace(rotation=SimpleNamespace(matrix=lambda: south))
+    images = {str(k): SimpleNamespace(cam_from_world=lambda: pose) for k in range(12)}
+    fit = SimpleNamespace(similarity=SimpleNamespace(rotation=np.eye(3)), north_error_deg=1.0, scale_error=0.01)
+    said = {"d:GimbalPitchDegree": "-90.0"}, {"d:GimbalPitchDegree": "-90.0", "d:GimbalYawDegree": "0.0"}
+    notes = []
+    for xmp in said:
+        attitude = likeliest_attitude(read_attitudes(xmp)[0])
+        taken = [SimpleNamespace(name=name, attitude=attitude) for name in images]
+        notes.append(checked_by_headings(fit, images, taken, np.linspace(0, 1, len(images)))[1])
+    assert notes[0] == []
+    assert "north is turned by 180" in notes[1][0]
 
 
 @pytest.mark.parametrize("lag_m", [-3.0, 3.0])

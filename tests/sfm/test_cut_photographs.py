@@ -11,8 +11,10 @@ from PIL import Image
 
 from support.flights import write_photograph
 from support.small_flights import COUNT, flight, picture, pixels
+from vdgs.sfm.cross_checks import cross_checked
 from vdgs.sfm.cut_pictures import cut_pictures
 from vdgs.sfm.edited_names import first_stems
+from vdgs.sfm.focal_length import EQUIVALENT, Lens
 from vdgs.sfm.image_list import collect_images
 
 WHOLE = (160, 120)
@@ -46,6 +48,7 @@ def test_pictures_that_are_cut_on_both_sides_are_left_out_where_they_are_few(tmp
     [
         (160, 90),
         (120, 120),
+        (118, 118),
         (80, 45),
         (60, 60),
         (80, 60),
@@ -61,6 +64,17 @@ def test_modes_of_a_camera_are_used(tmp_path, size):
     """The whole width or height of the sensor, with half the pixels across, too, or larger; stills of the size of
     films, shrunk from the whole width; and what was shrunk alone."""
     assert left_out_of(tmp_path, size) == []
+
+
+@pytest.mark.parametrize(("size", "focal"), [((118, 118), 0.7 * 160 / 118), ((158, 119), 0.7), ((80, 60), 0.7)])
+def test_a_mode_of_nearly_the_whole_height_has_the_pixels_of_the_others(tmp_path, size, focal):
+    """As phones and cameras take 2992 x 2992 px of 4000 x 3000. A shrunk one of the shape of the others has not."""
+    flight(tmp_path)
+    images = [replace(photo, lens=Lens(0.7, EQUIVALENT)) for photo in collect_images([tmp_path]).images]
+    images[0] = replace(images[0], width=size[0], height=size[1])
+    lens = cross_checked(images)[0].lens
+    assert lens is not None
+    assert lens.focal == pytest.approx(focal)
 
 
 def cut_copy(folder: Path, name: str, file: Path, box: tuple[int, int, int, int], moment: str = "") -> None:

@@ -205,6 +205,42 @@ def test_skydios_calibration_is_a_structure_and_its_heights_are_over_the_ellipso
     assert read_altitude({5: b"\0", 6: 400.0}, xmp) == (400.0, "ellipsoidal as recorded")
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.95, 0.92, 0.86, 0.81, 0.75, 0.5])
+@pytest.mark.parametrize("rewritten", [False, True])
+@pytest.mark.parametrize(
+    ("model", "details", "whole", "focal_px", "center"),
+    [
+        pytest.param("M3E", {0x920A: 12.29, 0xA405: 24}, (5280, 3956), 3713, (2640, 1978), id="M3E"),
+        pytest.param("M3E", {}, (5280, 3956), 3713, (2640, 1978), id="and no equivalent"),
+        pytest.param("M3E", {0x920A: 12.29, 0xA405: 24}, (5280, 3956), 3713, (2640,), id="and no row"),
+        pytest.param("FC330", {0x920A: 3.61, 0xA405: 20}, (4000, 3000), 2344, (2000,), id="P4"),
+        pytest.param("FC6310", {0x920A: 8.8, 0xA405: 24}, (4864, 3648), 3666, (2432, 1824), id="P4P, 4 x 3"),
+        pytest.param("FC6310", {0x920A: 8.8, 0xA405: 24}, (4864, 3648), 3666, (2736, 1824), id="of the sensor"),
+    ],
+)  # fmt: skip
+def test_a_calibration_is_of_the_pixels_that_its_center_lies_amid(
+    model, details, whole, focal_px, center, rewritten, factor
+):
+    """Of photographs that were shrunk by little, too, with EXIF's size rewritten or not."""
+    width, height = (round(factor * side) for side in whole)
+    size = dict(zip((0xA002, 0xA003), (width, height) if rewritten else whole, strict=True))
+    axes = "".join(f'd:CalibratedOpticalCenter{a}="{each}" ' for a, each in zip("XY", center, strict=False))
+    xmp = packet(f'd:CalibratedFocalLength="{focal_px}" {axes}')
+    lens = read_lens({0x0110: model}, {**details, **size}, xmp, width, height)
+    assert lens is not None
+    assert lens.focal == pytest.approx(focal_px / whole[0], rel=1e-3)
+
+
+@pytest.mark.parametrize(("center", "factor"), [("6.6,4.4", 1.0), ("6.6,4.4", 0.85), ("6.73,4.33", 1.0), ("0,0", 1.0)])
+def test_a_density_of_pixels_yields_to_pix4ds_principal_point_where_the_photograph_was_shrunk(center, factor):
+    width, height = round(5472 * factor), round(3648 * factor)
+    details = {0x920A: 8.8, 0xA002: width, 0xA003: height, 0xA20E: 5472 / 13.2, 0xA210: 4}
+    xmp = packet(f'Camera:PerspectiveFocalLength="8.8" Camera:PrincipalPoint="{center}"')
+    lens = read_lens({}, {**details, 0x920A: 0}, xmp, width, height)
+    assert lens is not None
+    assert lens.focal == pytest.approx(8.8 / 13.2, rel=1e-3)
+
+
 def test_heights_of_a_named_geoid():
     assert read_altitude({5: b"\0", 6: 400.0}, packet('CRSInfo:VERTCRS="EGM96"')) == (400.0, "EGM96 as recorded")
 

@@ -158,34 +158,6 @@ def test_maps_of_ours_among_photographs_are_left_out(tmp_path):
     assert any("maps" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("rewritten", [False, True])
-def test_smaller_copies_in_another_folder_are_left_out(tmp_path, rewritten):
-    """Also those into which a program wrote its own date."""
-    names = flight(tmp_path / "full")
-    for name in names:
-        with Image.open(tmp_path / "full" / name) as image:
-            exif, shown = image.getexif(), np.asarray(image.resize((320, 240)))
-        picture(tmp_path / "full" / name, shown, exif=exif)
-        if rewritten:
-            exif.get_ifd(0x8769)[0x9003] = "2026:07:01 12:00:00"
-        picture(tmp_path / "web" / name, shown[::2, ::2], exif=exif)
-    found = collect_images([tmp_path])
-    assert [photo.name for photo in found.images] == [f"full/{name}" for name in names]
-    assert all("smaller copy of full/" in each.reason for each in found.excluded)
-
-
-@pytest.mark.parametrize(("late_s", "east_m"), [(1800, 0.0), (0, 50.0)])
-def test_smaller_photographs_of_another_flight_are_no_copies(tmp_path, late_s, east_m):
-    """Whose files count from 1 again: 48 megapixels, then 12."""
-    for folder, count, size, late, east in (("1", 6, (320, 240), 0, 0.0), ("2", 4, (160, 120), late_s, east_m)):
-        (tmp_path / folder).mkdir()
-        for k in range(count):
-            place = np.array([10.0 * k + east, 0.0, 40.0])
-            write_photograph(tmp_path / folder / f"DJI_{k:04d}.JPG", pixels(k, *size), k + late, place)
-    found = collect_images([tmp_path])
-    assert (len(found.images), found.excluded) == (10, ())
-
-
 def test_versions_of_photographs_in_another_folder_are_left_out(tmp_path):
     """Edited or raw; and not what another camera of a rig shows, at the same moments and places."""
     names = flight(tmp_path / "z")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import feature_matching, reconstruct
 from vdgs.sfm.feature_extraction import count_features
 from vdgs.sfm.focal_decision import should_fix_focal
+from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.reconstruction_plan import plan_reconstruction
 from vdgs.sfm.step_keys import step_keys
 from vdgs.sfm.workspace import Workspace
@@ -50,6 +52,29 @@ def test_models_are_made_anew_where_positions_that_come_later_hold_the_focal_len
         keys.append(step_keys(plan, read_digests(request.output)))
     assert held == [False, True]
     assert {step for step in keys[0] if keys[0][step] == keys[1][step]} == {"features", "matches", "capture"}
+
+
+def test_captures_are_placed_anew_where_a_list_or_positions_are_said_to_be_of_another_system(tmp_path):
+    """A list of the same numbers, whose heights are said to be the metres that they were only taken for."""
+    card = strips(tmp_path / "card", tmp_path / "gps.csv")
+    request = SfmRequest(image_folders=(card,), output=tmp_path / "capture", gps=tmp_path / "gps.csv")
+    plan = plan_reconstruction(request)
+    guessed = GcpList((), "NAD83 / Ohio North (ftUS)", "gcp.txt", (), unsaid_height_unit_m=0.3048)
+    told = replace(guessed, unsaid_height_unit_m=None)
+    positions = plan.gps_priors
+    plans = [
+        plan,
+        replace(plan, gcps=guessed),
+        replace(plan, gcps=told),
+        replace(plan, gcps=replace(told, crs="NAD83(2011) / Ohio North (ftUS)")),
+        replace(plan, gcps=replace(told, datum_error_m=2.0)),
+        replace(plan, gps_priors=replace(positions, datum_errors_m=np.full(len(positions), 2.0))),
+        replace(plan, gps_priors=replace(positions, altitude_reference="over the ellipsoid")),
+        replace(plan, gps_priors=replace(positions, are_stated=~positions.are_stated)),
+    ]
+    keys = [step_keys(each, read_digests(request.output)) for each in plans]
+    assert len({each["placed"] for each in keys}) == len(plans)
+    assert len({each["capture"] for each in keys}) == 1
 
 
 @pytest.mark.slow

@@ -14,10 +14,15 @@ from vdgs.errors import CaptureError
 _DATE_TAKEN, _DATE = 0x9003, 0x0132
 #: EXIF's form: 2026:06:23 16:31:59; some programs write other signs (2026-06-23T16:31:59).
 _FORM = re.compile(r"(\d{4})[:/.-](\d\d)[:/.-](\d\d)[ T](\d\d:\d\d)")
+#: A date without this is that of a clock that was never set.
+_SET = re.compile("[^0\\W]")
 
 
 def exif_form(moment: str) -> str:
-    """A date and time with EXIF's signs, whatever signs a program wrote; other texts as they are."""
+    """A date and time with EXIF's signs, whatever signs a program wrote; other texts as they are; empty for that of a
+    clock that was never set (`0000:00:00 00:00:00`)."""
+    if not _SET.search(moment):
+        return ""
     return _FORM.sub(r"\1:\2:\3 \4", moment, count=1) if _FORM.match(moment) else moment
 
 

@@ -14,7 +14,7 @@ from vdgs.captures.image_files import open_image
 from vdgs.sfm.cut_pictures import cut_pictures
 from vdgs.sfm.exif_gps import FLAT, VOID
 from vdgs.sfm.flights import flights_of
-from vdgs.sfm.focal_length import EQUIVALENT, Lens, unzoomed, zoomed
+from vdgs.sfm.focal_length import CUT, EQUIVALENT, Lens, unzoomed, zoomed
 from vdgs.sfm.image_metadata import BODY, GIMBAL, ImageMetadata, looks_backwards
 from vdgs.sfm.other_cameras import other_cameras
 from vdgs.sfm.photograph_versions import versions
@@ -113,8 +113,8 @@ def _doubted(photo: ImageMetadata, lens: Lens) -> ImageMetadata:
 
 
 def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
-    """Photographs that share the shorter side with most of their camera and lack some of the longer one were cut by a
-    program, which leaves the focal length in pixels as it was."""
+    """Photographs that share the shorter side with most of their camera, or nearly, and lack some of the longer one
+    were cut by a program or the camera, which leaves the focal length in pixels as it was."""
     known = [photo for photo in group if photo.lens is not None]
     if not known:
         return group
@@ -122,13 +122,20 @@ def _cropped(group: list[ImageMetadata]) -> list[ImageMetadata]:
     (size, usual_lens), found = usual, []
     for photo in group:
         lens, (short, longer) = photo.lens, sorted(photo.size)
-        cut = usual_lens is not None and min(size) == short and longer < max(size)
+        cut = usual_lens is not None and _is_cut_across((short, longer), sorted(size))
         if cut and lens and usual_lens and (lens.focal_mm, lens.source) == (usual_lens.focal_mm, usual_lens.source):
             doubt = "cut to another shape than most of its camera; the focal length in pixels is taken as theirs"
             focal = usual_lens.focal * max(size) / longer
             photo = replace(photo, lens=replace(lens, focal=focal), doubts=(*photo.doubts, doubt))
         found.append(photo)
     return found
+
+
+def _is_cut_across(sides: Sequence[int], whole: Sequence[int]) -> bool:
+    """Whether the sides of a picture, the shorter first, are those of a whole one, or nearly, of which some of the
+    longer side was cut off. A shrunk picture has its shape."""
+    shares = sides[0] / whole[0], sides[1] / whole[1]
+    return shares[0] == 1 > shares[1] or (1 - CUT <= shares[0] < 1 and shares[1] < (1 - CUT) * shares[0])
 
 
 def _near(one: float, other: float) -> bool:

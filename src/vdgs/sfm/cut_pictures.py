@@ -32,12 +32,12 @@ def cut_pictures(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
 
 def _is_cut(size: tuple[int, int], usual: tuple[int, int]) -> bool:
     """Whether a picture lacks both sides of photographs of the usual size, and is no mode of their camera: the whole
-    width or height, at a whole part of the pixels."""
+    width or height, or nearly (2992 x 2992 px of 4000 x 3000), at a whole part of the pixels."""
     (short, longer), (usual_short, usual_longer) = sorted(size), sorted(usual)
     shares = short / usual_short, longer / usual_longer
     whole = max(shares)  # how much it was shrunk if nothing but its shape was cut
     side, usual_side = (short, usual_short) if shares[0] == whole else (longer, usual_longer)
-    if whole >= 1 or usual_side % side == 0 or 1 - min(shares) / whole < CUT:
+    if whole >= 1 - CUT or usual_side % side == 0 or 1 - min(shares) / whole < CUT:
         return False
     return not any(abs(longer / short / shape - 1) < CUT / 2 for shape in _SHAPES)
 

@@ -48,6 +48,9 @@ SENSOR, EQUIVALENT = "EXIF's focal length and sensor", "EXIF's 35 mm equivalent"
 AGREE = 1.25
 #: Sides of a picture whose proportions differ by more than this share were cut.
 CUT = 0.02
+#: The optical center lies off the middle of the sensor by up to half of this share of a side. Coordinates that lie
+#: beyond that by one factor, up to `EVEN`, are those of a picture that was shrunk (choice).
+OFF_MIDDLE, EVEN = 0.03, 0.005
 #: No sensor of a camera has pixels that are wider (millimetres; thermal ones have up to 0.05).
 MAX_PIXEL_MM = 0.08
 #: The shorter side of a whole picture whose pixels are not known; the shape alone counts.
@@ -101,13 +104,16 @@ def read_lens(
     kept = zoom * frame.kept
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
     in_table = _by_sensor(focal_mm, _used_width(model, *frame.sides))
+    equivalent = _by_equivalent(equivalent_mm, *frame.sides)
+    likely = None if equivalent_mm == focal_mm else _times(equivalent, 1 / zoom)
+    hints = _Hints(min(frame.sides) / max(frame.sides), in_table, likely)
     measured = [
-        (_times(_calibrated(xmp, original, part), kept), CALIBRATED_SOURCE),
+        (_times(_calibrated(xmp, original, part, hints), kept), CALIBRATED_SOURCE),
         (_times(_by_sensor(focal_mm, _sensor(details, original)), kept), SENSOR),
         (_times(in_table, kept / part), f"EXIF's focal length, the sensor of {model}"),
-        (_times(_by_pix4d(xmp, _sensor(details, original), original, part), kept), PIX4D_SOURCE),
+        (_times(_by_pix4d(xmp, _sensor(details, original), original, part, hints), kept), PIX4D_SOURCE),
     ]
-    equivalent = as_written = _times(_by_equivalent(equivalent_mm, *frame.sides), frame.kept / part)
+    equivalent = as_written = _times(equivalent, frame.kept / part)
     equivalent = _zoomed_equivalent(equivalent, [focal for focal, _ in measured], zoom)
     ways = [*measured, (equivalent, EQUIVALENT)]
     known = [(focal, source) for focal, source in ways if focal and MIN_FOCAL < focal < MAX_FOCAL]
@@ -292,7 +298,44 @@ def _calibrated_width(xmp: Mapping[str, str]) -> float | None:
     return _times(first_number(xmp, "CalibratedOpticalCenterX", "CalibratedOpticalCenter:X"), 2)
 
 
-def _calibrated(xmp: Mapping[str, str], original: float, part: float) -> float | None:
+@dataclass(frozen=True)
+class _Hints:
+    """What tells whether a program that shrank a photograph rewrote its size, too."""
+
+    shape: float
+    """The shorter side of the picture over the longer one."""
+    in_table: float | None
+    """The focal length over the longer side, by the table of sensors."""
+    equivalent: float | None
+    """And by the 35 mm equivalent."""
+
+
+def _whole_side(side: float, center: Sequence[float], focal: float, hints: _Hints) -> float:
+    """The longer side that a measured focal length is of: `side`, as EXIF's size says it, or what the optical center of
+    the measurement lies in the middle of. All are in pixels, or all in millimeters.
+
+    A photograph that was shrunk has the whole width or height of that, so that the smaller of two factors counts. One
+    that a camera cuts out of its sensor may have the center of either: the nearer to the table of sensors is taken. A
+    center whose coordinates both say the same factor is believed more than the 35 mm equivalent, a whole number.
+    """
+    sides = sorted(2 * each for each in center if each > 0)[::-1]
+    if not sides:
+        return side
+    factors = [whole / present for whole, present in zip(sides, (side, side * hints.shape), strict=False)]
+    whole = min(factors) * side
+    if abs(whole / side - 1) < OFF_MIDDLE:
+        return side
+    if not 1 / AGREE < whole / side < AGREE:
+        return whole
+    tolerance = EVEN if abs(whole / side - 1) < 2 * OFF_MIDDLE else OFF_MIDDLE  # so far off the middle lies no center
+    is_even = len(factors) > 1 and max(factors) / min(factors) < 1 + tolerance
+    likely = hints.in_table or (None if is_even else hints.equivalent)
+    if likely is None:
+        return whole if is_even else side
+    return min((side, whole), key=lambda each: abs(math.log(focal / each / likely)))
+
+
+def _calibrated(xmp: Mapping[str, str], original: float, part: float, hints: _Hints) -> float | None:
     """DJI: DewarpData is `date;fx,fy,cx,cy,...` in pixels of the original, CalibratedFocalLength is fx alone (Skydio: a
     structure). Pix4D's matrix of fisheyes counts angles in quarter turns. Of the original a `part` was left."""
     words = text(xmp, "DewarpData").partition(";")[2].split(",")
@@ -303,19 +346,28 @@ def _calibrated(xmp: Mapping[str, str], original: float, part: float) -> float |
             first_number(xmp, "CalibratedFocalLength", "CalibratedFocalLength:X")
             or 2 / math.pi * _numbers(xmp, "Camera:FisheyeAffineMatrix")[0]
         )
+    if not math.isfinite(focal) or focal <= 0:
+        return None
     width = _calibrated_width(xmp)
-    if width and (part < 1 or not 1 / AGREE < width / original < AGREE):
-        original = width * part  # a program that shrank the photograph wrote its new size into EXIF
-    return focal / original if math.isfinite(focal) and focal > 0 else None
+    if width and part < 1:
+        return focal / (width * part)
+    centers = (first_number(xmp, f"CalibratedOpticalCenter{axis}", f"CalibratedOpticalCenter:{axis}") for axis in "XY")
+    return focal / _whole_side(original, [each for each in centers if each] if width else [], focal, hints)
 
 
-def _by_pix4d(xmp: Mapping[str, str], sensor_mm: float | None, original: float, part: float) -> float | None:
+def _by_pix4d(
+    xmp: Mapping[str, str], sensor_mm: float | None, original: float, part: float, hints: _Hints
+) -> float | None:
     """Pix4D's names: millimetres, unless the unit is another (pixels), and where the view meets the sensor, near the
-    middle of its width, of which a `part` was left."""
+    middle of its sides, of which a `part` was left."""
     focal = _numbers(xmp, "Camera:PerspectiveFocalLength")[0]
     if text(xmp, "Camera:PerspectiveFocalLengthUnits").lower() not in ("", "mm"):
         return focal / original
-    return _by_sensor(focal, sensor_mm or 2 * part * _numbers(xmp, "Camera:PrincipalPoint")[0])
+    center = _numbers(xmp, "Camera:PrincipalPoint")
+    if not sensor_mm:
+        return _by_sensor(focal, 2 * part * center[0])
+    whole_mm = _whole_side(sensor_mm, center[:2], focal, hints) if part == 1 and focal > 0 else sensor_mm
+    return _by_sensor(focal, whole_mm) or _by_sensor(focal, sensor_mm)
 
 
 def _numbers(xmp: Mapping[str, str], name: str) -> list[float]:

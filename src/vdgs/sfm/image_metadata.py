@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class Attitude:
     """Rows of `camera_from_enu` [3, 3] are the camera's right, down and forward as east, north, up."""
 
     camera_from_enu: np.ndarray
+    has_heading: bool = True
+    """False where none was recorded, and 0 stands for it; nothing but `gravity` is known then."""
 
     @property
     def tilt_deg(self) -> float:
@@ -141,7 +143,8 @@ def read_attitudes(xmp: Mapping[str, str]) -> tuple[dict[str, Attitude], str]:
         found = {}
         for reading in readings:
             from_angles, sign = _READINGS[reading]
-            found[reading] = from_angles(yaw or 0.0, pitch, sign * (roll or 0.0))
+            angles = yaw or 0.0, pitch, sign * (roll or 0.0)
+            found[reading] = replace(from_angles(*angles), has_heading=yaw is not None)
         attitude = likeliest_attitude(found)
         known = attitude is not None and (yaw is not None or attitude.tilt_deg < NEARLY_DOWN_DEG)
         return (found if known else {}), ""

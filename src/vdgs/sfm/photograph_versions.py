@@ -5,18 +5,20 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from pathlib import PurePosixPath
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from PIL import Image, ImageOps
 
 from vdgs.captures.image_files import open_image, same_aspect
 from vdgs.sfm.brackets import SAME_STOPS
 from vdgs.sfm.edited_names import first_stems, say_copy
-from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.image_metadata import SERIAL, UNKNOWN_CAMERA, ImageMetadata
 from vdgs.sfm.rig_folders import may_be_sensor
 
 #: A smaller copy has at most this share of the longer side of the photograph of its name.
@@ -42,8 +44,12 @@ _SEARCHED_PX, _SEARCHED_SIZES, _SAME_PART = 320, 24, 0.8
 _LEAST_PART_PX = 40
 #: Sides of the small picture that tells it.
 _LOOKED_AT = (128, 128)
+#: So many of these are kept where photographs are compared with several others.
+_KEPT_LOOKS = 512
 
 Folder = Mapping[str, ImageMetadata]
+Pair: TypeAlias = tuple[ImageMetadata, ImageMetadata]
+Ranks: TypeAlias = Callable[[Path], Float32[np.ndarray, "n"]]
 
 
 def versions(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
@@ -73,12 +79,12 @@ def _are_of_other_places(photo: ImageMetadata, other: ImageMetadata) -> bool:
     return bool(np.abs(np.subtract(photo.lat_lon, other.lat_lon)).max() > _ROUNDED_DEG)
 
 
-def _is_copy(photo: ImageMetadata, other: ImageMetadata) -> bool:
-    """Whether two photographs of one name and shape are one. Programs rewrite dates: where those alone differ, what the
-    photographs show tells."""
-    if _are_of_other_places(photo, other):
-        return False
-    return not taken_apart(photo, other) or _show_the_same([(photo, other)])
+def _are_of_other_cameras(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    """Whether both say their camera, and these differ. Programs may drop the serial number, or all."""
+    (model, _, serial), (other_model, _, other_serial) = (each.camera.partition(SERIAL) for each in (photo, other))
+    if UNKNOWN_CAMERA not in (model, other_model) and model != other_model:
+        return True
+    return bool(serial and other_serial) and serial != other_serial
 
 
 def _cut_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
@@ -149,26 +155,46 @@ def _are_of_a_rig(photo: ImageMetadata, other: ImageMetadata) -> bool:
 
 
 def _smaller_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
-    """Previews and thumbnails: of the name and shape of a larger photograph, in another folder, and not of another
-    flight, whose files count from 1 again."""
+    """Previews and thumbnails: of the name and shape of a larger photograph of the camera and place, as far as both say
+    these, and they show the same. Frames of other films and photographs of other flights count from 1, too."""
     stems: dict[str, list[ImageMetadata]] = {}
     for photo in photographs:
         stems.setdefault(PurePosixPath(photo.name).stem.lower(), []).append(photo)
     usual = Counter(photo.size for photo in photographs).most_common(1)[0][0] if photographs else (0, 0)
-    reasons = {}
+    pairs: dict[tuple[object, ...], list[Pair]] = {}
     for alike in stems.values():
         for photo in alike:
-            larger = [
-                other
-                for other in alike
-                if max(photo.size) <= SMALLER * max(other.size)
-                and same_aspect(photo.size, other.size)
-                and _is_copy(photo, other)
-            ]
-            if larger and photo.size != usual:
-                largest = max(larger, key=lambda other: other.width * other.height)
-                reasons[photo.name] = f"is a smaller copy of {largest.name}"
-    return reasons
+            for other in alike if photo.size != usual else ():
+                if _may_be_smaller_copy(photo, other):
+                    folders = PurePosixPath(photo.name).parent, PurePosixPath(other.name).parent
+                    pairs.setdefault((*folders, taken_apart(photo, other)), []).append((photo, other))
+    ranks = lru_cache(_KEPT_LOOKS)(_gray_ranks)
+    copies = [pair for each in pairs.values() for pair in _showing_the_same(each, ranks)]
+    copies.sort(key=lambda pair: pair[1].width * pair[1].height)  # the largest is the last that is named
+    found = {photo.name: f"is a smaller copy of {other.name}" for photo, other in copies}
+    return {photo.name: found[photo.name] for photo in photographs if photo.name in found}
+
+
+def _may_be_smaller_copy(photo: ImageMetadata, other: ImageMetadata) -> bool:
+    if max(photo.size) > SMALLER * max(other.size) or not same_aspect(photo.size, other.size):
+        return False
+    return not (_are_of_other_places(photo, other) or _are_of_other_cameras(photo, other))
+
+
+def _showing_the_same(pairs: Sequence[Pair], ranks: Ranks) -> Sequence[Pair]:
+    """Of pairs of the photographs of two folders those that show the same: all or none where a few agree on that, as
+    to decode thousands takes minutes; else each is looked at."""
+    few = {_is_seen_to_be_one(*pair, ranks) for pair in _few(pairs)}
+    if len(few) == 1:
+        return pairs if few.pop() else []
+    return [pair for pair in pairs if _is_seen_to_be_one(*pair, ranks)]
+
+
+def _is_seen_to_be_one(photo: ImageMetadata, other: ImageMetadata, ranks: Ranks) -> bool:
+    """Whether two photographs show the same; of raw files, which are not looked at, whether both say one moment."""
+    if "raw" in (photo.kind, other.kind):
+        return bool(photo.datetime and other.datetime) and not taken_apart(photo, other)
+    return _alike(photo, other, ranks) >= SAME_PICTURE
 
 
 def _later_copies(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
@@ -220,14 +246,20 @@ def _saved_again(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
         if photo.datetime and not photo.is_bare and photo.kind != "raw":
             folder = str(PurePosixPath(photo.name).parent)
             moments.setdefault((folder, photo.camera, photo.datetime), []).append(photo)
-    usual = Counter(_kind_of_name(photo) for photo in photographs)
-    found = dict[str, str]()
+    kinds = {photo.name: _kind_of_name(photo) for photo in photographs}
+    usual = Counter(kinds.values())
+    found, ranks = dict[str, str](), lru_cache(_KEPT_LOOKS)(_gray_ranks)
     for alike in moments.values():
-        ordered = sorted(alike, key=lambda photo: (-usual[_kind_of_name(photo)], -photo.width, photo.name))
-        for k, photo in enumerate(ordered):
-            first = next((one for one in ordered[:k] if one.name not in found and _is_saved_again(photo, one)), None)
+        if len({kinds[photo.name] for photo in alike}) == 1:  # of a clock that stood still, all may be of one moment
+            continue
+        firsts: dict[str, list[ImageMetadata]] = {}  # by the kinds of their names
+        for photo in sorted(alike, key=lambda photo: (-usual[kinds[photo.name]], -photo.width, photo.name)):
+            others = (one for kind, each in firsts.items() if kind != kinds[photo.name] for one in each)
+            first = next((one for one in others if _is_saved_again(photo, one, ranks)), None)
             if first is not None:
                 found[photo.name] = f"is a copy of {first.name}, by its camera, moment, place and what it shows"
+            else:
+                firsts.setdefault(kinds[photo.name], []).append(photo)
     return found
 
 
@@ -236,12 +268,12 @@ def _kind_of_name(photo: ImageMetadata) -> str:
     return re.sub(r"\d+", "#", PurePosixPath(photo.name).with_suffix("").as_posix().lower())
 
 
-def _is_saved_again(photo: ImageMetadata, first: ImageMetadata) -> bool:
-    if _kind_of_name(photo) == _kind_of_name(first) or (photo.lat_lon is None) != (first.lat_lon is None):
+def _is_saved_again(photo: ImageMetadata, first: ImageMetadata, ranks: Ranks) -> bool:
+    if (photo.lat_lon is None) != (first.lat_lon is None):
         return False
     if _are_of_two_lenses(*(PurePosixPath(each.name).stem for each in (photo, first))):
         return False
-    return _is_one_exposure(first, photo) and _alike(first, photo) >= SAVED_AGAIN
+    return _is_one_exposure(first, photo) and _alike(first, photo, ranks) >= SAVED_AGAIN
 
 
 def _are_of_two_lenses(one: str, other: str) -> bool:
@@ -279,11 +311,11 @@ def _versions_elsewhere(photographs: Sequence[ImageMetadata]) -> dict[str, str]:
     return found
 
 
-def _of_one_name(one: Folder, other: Folder) -> list[tuple[ImageMetadata, ImageMetadata]]:
+def _of_one_name(one: Folder, other: Folder) -> list[Pair]:
     return [(one[stem], other[stem]) for stem in sorted(one.keys() & other.keys())]
 
 
-def _of_one_moment(one: Folder, other: Folder) -> list[tuple[ImageMetadata, ImageMetadata]]:
+def _of_one_moment(one: Folder, other: Folder) -> list[Pair]:
     """The photographs of two folders by one camera of a moment at which it took no others of theirs."""
     moments, others = _by_moment(one), _by_moment(other)
     return [(moments[when], others[when]) for when in sorted(moments.keys() & others.keys())]
@@ -313,32 +345,37 @@ def _may_be_one_exposure(one: ImageMetadata, other: ImageMetadata) -> bool:
     return abs(one.exposure_stops - other.exposure_stops) < SAME_STOPS
 
 
-def _show_the_same(pairs: Sequence[tuple[ImageMetadata, ImageMetadata]]) -> bool:
+def _show_the_same(pairs: Sequence[Pair]) -> bool:
     """Whether the photographs of each pair show the same in any brightness and contrast, by a few of them. A raw file
     and a picture of one exposure do."""
-    chosen = [pairs[k] for k in sorted({len(pairs) * part // LOOKED_AT_PAIRS for part in range(LOOKED_AT_PAIRS)})]
-    for one, other in chosen:
-        if (one.kind == "raw") == (other.kind == "raw") and _alike(one, other) < SAME_PICTURE:
+    for one, other in _few(pairs):
+        if (one.kind == "raw") == (other.kind == "raw") and _alike(one, other, _gray_ranks) < SAME_PICTURE:
             return False
     return True
 
 
-def _alike(one: ImageMetadata, other: ImageMetadata) -> float:
+def _few(pairs: Sequence[Pair]) -> list[Pair]:
+    """Some of many, evenly; all of few."""
+    return [pairs[k] for k in sorted({len(pairs) * part // LOOKED_AT_PAIRS for part in range(LOOKED_AT_PAIRS)})]
+
+
+def _alike(one: ImageMetadata, other: ImageMetadata, ranks: Ranks) -> float:
     """How well the order of the gray values of two photographs correlates; -1 where one shows nothing."""
-    ranks = _gray_ranks(one), _gray_ranks(other)
-    return float(np.corrcoef(ranks)[0, 1]) if all(np.any(each) for each in ranks) else -1.0
+    seen = ranks(one.path), ranks(other.path)
+    return float(np.corrcoef(seen)[0, 1]) if all(np.any(each) for each in seen) else -1.0
 
 
-def _gray_ranks(photo: ImageMetadata) -> np.ndarray:
-    """Which place each pixel [n] of a small upright picture has by its brightness, from the middle one; zeros for a
+def _gray_ranks(path: Path) -> Float32[np.ndarray, "n"]:
+    """Which place each pixel of a small upright picture has by its brightness, from the middle one; zeros for a
     picture of one gray value, and for one that Pillow does not read."""
     try:
-        with open_image(photo.path) as image:
+        with open_image(path) as image:
             image.draft("L", (2 * _LOOKED_AT[0], 2 * _LOOKED_AT[1]))
-            small = ImageOps.exif_transpose(image).convert("L").resize(_LOOKED_AT, Image.Resampling.BOX)
+            gray_mode = "F" if image.mode.startswith(("I", "F")) else "L"  # Pillow cuts off what has more than 8 bits
+            small = ImageOps.exif_transpose(image).convert(gray_mode).resize(_LOOKED_AT, Image.Resampling.BOX)
             gray = np.asarray(small).ravel()
     except (OSError, SyntaxError, ValueError):
-        return np.zeros(_LOOKED_AT[0] * _LOOKED_AT[1])
+        return np.zeros(_LOOKED_AT[0] * _LOOKED_AT[1], np.float32)
     ordered = np.sort(gray)
     ranks = np.searchsorted(ordered, gray) + np.searchsorted(ordered, gray, side="right")
-    return np.asarray(ranks - ranks.mean())
+    return np.asarray(ranks - ranks.mean(), np.float32)

@@ -57,7 +57,7 @@ def _turned(fit: PositionFit, images: Mapping[str, pycolmap.Image], taken: Seque
         [
             fit.similarity.rotation @ images[photo.name].cam_from_world().rotation.matrix().T
             @ photo.attitude.camera_from_enu
-            for photo in taken if photo.attitude is not None
+            for photo in taken if photo.attitude is not None and photo.attitude.has_heading
         ]
     ).reshape(-1, 3, 3)  # fmt: skip
     if len(turns) < ENOUGH_HEADINGS:

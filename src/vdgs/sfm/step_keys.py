@@ -42,8 +42,24 @@ def step_keys(plan: ReconstructionPlan, digests: ContentDigests) -> dict[str, st
     points, bars = plan.gcps.points if plan.gcps else (), plan.scale_bars
     told = [positions.image_indices.tolist(), positions.enu.tolist(), positions.gps_std.tolist(), positions.origin]
     known = [record_to_dict(point) for point in points], bars and record_to_dict(bars)
-    placed = cache_key(capture, told, known, options.georeference)
+    placed = cache_key(capture, told, known, options.georeference, *_told_systems(plan))
     return {"features": found, "matches": matched, "model": mapped, "capture": capture, "placed": placed}
+
+
+def _told_systems(plan: ReconstructionPlan) -> list[Any]:
+    """What lists and tables say beside metres and their accuracy: the system, whether the unit of heights is guessed,
+    which are those of a datum that may be off, what altitudes are over and which accuracies are stated. Heights that
+    are said to be metres are those that were only taken as metres, and place the scene otherwise. Empty where nothing
+    of it is said."""
+    gcps, positions = plan.gcps, plan.gps_priors
+    told = list[Any]()
+    if gcps is not None:
+        told.append((gcps.crs, gcps.unsaid_height_unit_m, gcps.datum_error_m))
+    if positions.datum_errors_m.any():
+        told.append(positions.datum_errors_m.tolist())
+    if plan.request.gps is not None:  # photographs, which say it else, are compared themselves
+        told.append((positions.altitude_reference, positions.has_altitudes, positions.are_stated.tolist()))
+    return told
 
 
 def _other_cameras(plan: ReconstructionPlan) -> list[tuple[str, ...]]:

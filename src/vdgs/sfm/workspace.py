@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import threading
 import time
@@ -36,6 +37,8 @@ _UNITS = {"frames": "seconds", "matching": "pairs"}
 _POLL_SECONDS = 0.2
 #: Work that takes fewer seconds needs no lines about how far it is.
 _MIN_LOG_SECONDS = 30.0
+#: What SQLite and the system say of a disk that is full.
+_FULL_DISK = re.compile(r"disk is full|disk I/O|No space left")
 #: What stands behind the key of a step that was begun.
 _BY = " by vdgs "
 _VERSION = f"{_BY}{__version__}"
@@ -220,7 +223,7 @@ def explain_colmap_errors(folder: Path | None) -> Iterator[None]:
         yield
     except (RuntimeError, ValueError, IndexError) as error:
         said, where = " ".join(str(error).split()), "" if folder is None else f"{folder}: "
-        if folder is not None and (is_disk_full(folder) or "full" in said or "disk I/O" in said):
+        if folder is not None and (is_disk_full(folder) or _FULL_DISK.search(said)):
             raise VdgsError(
                 f"{where}the disk is full ({said}). Free some space; the same command then goes on."
             ) from error
