@@ -49,8 +49,10 @@ def with_take_off_heights(
     known = np.isfinite(geodetic[:, :2]).all(axis=1)
     heights = recorded_heights(photographs)
     altitudes = np.where(known, without_zero_altitudes(geodetic, known)[:, 2], np.nan)
-    used = _of_flights_without(altitudes, known, photographs) & np.isfinite(heights)
     found, kinds, own = geodetic.copy(), list(kinds), np.isfinite(altitudes)
+    used = known & ~own & np.isfinite(heights)
+    if used.any():
+        used &= _of_flights_without(altitudes, known, photographs)
     if not used.any():
         return geodetic, kinds, []
     take_offs = (altitudes - heights)[own & np.isfinite(heights)]
