@@ -14,7 +14,7 @@ pycolmap = pytest.importorskip("pycolmap")
 from vdgs.config.sfm_options import SfmOptions  # noqa: E402
 from vdgs.errors import CaptureError  # noqa: E402
 from vdgs.sfm import focal_decision, incremental_mapper, mapping  # noqa: E402
-from vdgs.sfm.capture_writer import fitted_intrinsics  # noqa: E402
+from vdgs.sfm.capture_writer import fitted_intrinsics, longest_focal  # noqa: E402
 from vdgs.sfm.feature_extraction import CameraGroup  # noqa: E402
 from vdgs.sfm.focal_decision import ASKED, CONFIRMED, OF_FLIGHTS, is_astray, is_held_as_good  # noqa: E402
 from vdgs.sfm.focal_length import Lens  # noqa: E402
@@ -61,6 +61,20 @@ def test_a_lens_that_is_none_is_astray_whatever_the_size_of_its_focal_length():
         with pytest.raises(CaptureError, match="none that there is"):
             fitted_intrinsics(model.cameras[1])
         assert is_astray(model, FITTED, [GROUP])
+
+
+def test_long_zooms_that_tags_say_are_lenses():
+    """16 times the longer side: a Zenmuse H20T at 20x. COLMAP ends at 10 where tags do not say more."""
+    model = model_of(16 * 1024.0)
+    assert fitted_intrinsics(model.cameras[1]).params[0] == 16 * 1024.0
+    with pytest.raises(CaptureError, match="none that there is"):
+        fitted_intrinsics(model_of(26 * 1024.0).cameras[1])
+    [zoom] = model.cameras.values()
+    zoom.has_prior_focal_length = False
+    assert longest_focal([zoom]) == 10.0
+    zoom.has_prior_focal_length = True
+    assert longest_focal([zoom]) == 25.0
+    assert longest_focal([model_of().cameras[1]]) == longest_focal([]) == 10.0
 
 
 @pytest.mark.parametrize("images", [4, 20])

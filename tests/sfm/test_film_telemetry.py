@@ -9,6 +9,7 @@ from itertools import pairwise
 import pytest
 
 from vdgs.errors import CaptureError
+from vdgs.sfm.films.film_reader import _start_place
 from vdgs.sfm.films.record_bends import RecordBends
 from vdgs.sfm.films.subtitle_files import read_subtitles
 from vdgs.sfm.films.telemetry import read_telemetry, telemetry_at
@@ -59,6 +60,17 @@ def test_where_the_film_began_tells_the_order_of_two_numbers():
     in_m = [(0.0, "GPS(47.1,8.2,0.0M) BAROMETER:1.0M")]
     assert read_telemetry(in_m, (8.2, 47.1))[0].lat_lon == (8.2, 47.1)
     assert read_telemetry(in_m)[0].lat_lon == (47.1, 8.2)  # as the Matrice 300 writes it
+
+
+@pytest.mark.parametrize("tag", ["+00.0000+000.0000/", "+0.0000+0.0000/", "+36.6146-006.1120+000.000/", None])
+def test_a_film_that_began_without_a_fix_tells_no_order_of_two_numbers(tag):
+    """0, 0 is as far from one order as from the other."""
+    place = _start_place({"location": tag} if tag else {})
+    [record] = read_telemetry([(0.0, "GPS(36.6146,-6.1120,0.0M) BAROMETER:10.3M")], place)
+    assert record.lat_lon == (36.6146, -6.112)
+    assert (place is None) == (tag is None or "36" not in tag)
+    known = {"location": "+00.0000+000.0000/", "location-eng": "+36.6146-006.1120/"}
+    assert _start_place(known) == (36.6146, -6.112)
 
 
 def test_no_fix_and_no_place_are_no_position():

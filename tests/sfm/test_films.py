@@ -449,7 +449,6 @@ def test_damaged_frames_are_left_out_up_to_the_next_key_frame(tmp_path: Path):
     numbers = [number + (number >= 12) for number in decoded]
     assert not {*numbers} & {*range(12, 20)}
     assert max(numbers) > 30
-    assert "1 packets are damaged" in said
     assert re.search(r"frames of [01]\.\d s are damaged, and left out", said)
     for number, photo in zip(numbers, images.images, strict=True):
         assert np.abs(np.asarray(Image.open(photo.path)).astype(float) - pictures[number]).mean() < 6

@@ -18,11 +18,12 @@ from vdgs.captures.position_fit import fit_positions
 from vdgs.captures.reconstruction import AccuracyFacts
 from vdgs.captures.up_axis import up_by_views
 from vdgs.geometry.similarity import Similarity, fit_similarity
-from vdgs.sfm import georegistration
+from vdgs.sfm import georeferencing, georegistration
 from vdgs.sfm.flights import untrusted_offsets
 from vdgs.sfm.georeferencing import FOOT_M, Doubts
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.height_units import of_gps
 
 pytestmark = pytest.mark.slow
 
@@ -457,11 +458,10 @@ def test_views_that_look_down_tell_up_over_a_slope():
 # ---------------------------------------------------------------------------------------------- control points
 
 
-def doubts(gps: bool = True, recorded: float | None = HEIGHT_M, altitude: float = 500.0) -> tuple[Doubts, np.ndarray]:
+def doubts(gps: bool = True, altitude: float = 500.0) -> tuple[Doubts, np.ndarray]:
     """A model that is in metres already, placed by GPS to 3 m, its points on the ground."""
     rng = np.random.default_rng(0)
     centers = strips(3, 4, 17.0, rng)
-    ground = rng.uniform(-40, 40, (200, 3)) * [1, 1, 0.01]
     accuracy = AccuracyFacts(
         place_m=(6.0, 12.0), scale_percent=5, scale_m=1, north_deg=1, level_deg=1, positions_m=(3.0, 3, 5)
     )
@@ -481,10 +481,8 @@ def doubts(gps: bool = True, recorded: float | None = HEIGHT_M, altitude: float 
     return Doubts(
         up=up,
         centers=centers,
-        ground=ground,
         by_gps=placed if gps else None,
         gps="EXIF",
-        recorded_height_m=recorded,
         altitude=altitude,
     ), marks
 
@@ -507,10 +505,9 @@ def test_control_points_with_x_and_y_exchanged_are_refused(gps):
         assert "x (east) and y (north)" in said_of(doubt, marks[:count], marks[:count, [1, 0, 2]])
 
 
-@pytest.mark.parametrize(("recorded", "gps"), [(HEIGHT_M, False), (None, True)])
 @pytest.mark.parametrize("feet", [FOOT_M, 1 / FOOT_M])
-def test_control_points_in_feet_are_refused(recorded, gps, feet):
-    doubt, marks = doubts(gps, recorded)
+def test_control_points_in_feet_are_refused(feet):
+    doubt, marks = doubts()
     assert "in feet" in said_of(doubt, marks, feet * marks)
 
 
@@ -520,6 +517,33 @@ def test_heights_in_feet_and_points_kilometers_off_are_refused():
     assert "Are they in feet" in said_of(doubt, marks, heights)
     assert "3.2 km from where GPS" in said_of(doubt, marks, marks + np.array([3200.0, 0, 0]))
     assert "2 km over those of GPS" in said_of(doubt, marks, marks + np.array([0, 0, 2000.0]))
+
+
+@pytest.mark.parametrize("off", [40.0, 160.0])
+@pytest.mark.parametrize("site", [220.0, 430.0, 900.0])
+def test_heights_over_a_gps_that_begins_at_zero_are_in_feet_by_no_means(site, off):
+    """A ground of about 0 is as far from heights in metres as from those in feet."""
+    doubt, marks = doubts(altitude=0.0)
+    assert "Are they in feet" not in said_of(doubt, marks, marks + np.array([0, 0, site]))
+    in_feet = (marks[:, 2] + 500 + off) / FOOT_M - 500  # what is off by a geoid is told, by more is not
+    assert ("Are they in feet" in said_of(*doubts(), np.c_[marks[:, :2], in_feet])) == (off < 60)
+
+
+@pytest.mark.parametrize("off", [120.0, 430.0, 1200.0])
+def test_heights_over_the_take_off_say_nothing_against_surveyed_ones(off):
+    doubt, marks = doubts(altitude=0.0)
+    assert doubt.by_gps is not None
+    over_sea = GpsPriors(
+        image_indices=np.arange(3), enu=np.zeros((3, 3)), gps_std=np.ones((3, 3)), origin=(0.0, 0.0, 60.0),
+        altitude_reference="", source="EXIF", notes=(),
+    )  # fmt: skip
+    placed = replace(doubt.by_gps, residuals=np.full((12, 3), [0.0, 0.0, off]))
+    for positions, is_told in ((over_sea, True), (replace(over_sea, over_take_off=True), False)):
+        by_gps = georeferencing._at_sea(doubt.by_gps, positions)
+        said = said_of(replace(doubt, by_gps=by_gps), marks, marks + np.array([0, 0, off]))
+        assert bool(said) == (is_told and off > 1000)
+        assert bool(of_gps(placed, by_gps, "gcp.txt", "EXIF")) == is_told
+        assert "2 times" in said_of(replace(doubt, by_gps=by_gps), marks, 2 * marks)  # places count all the same
 
 
 def test_points_that_fit_nothing_are_refused():

@@ -102,6 +102,18 @@ def test_heights_that_nothing_tells_are_metres_and_the_note_says_how_to_say_it()
     assert with_height_unit(said, located, ORIGIN, 0.01, gps(3.0, 60.0), "EXIF") == (said, "")
 
 
+@pytest.mark.parametrize("height_m", [200.0, 300.0, 480.0])
+def test_a_gps_that_begins_at_zero_tells_no_feet(height_m):
+    """As one does of heights over the take-off that is said to be one over the sea."""
+    places = surveyed(6, 0.0, height_m, np.random.default_rng(1))
+    located = dict(enumerate(places))
+    read, note = with_height_unit(list_of(places, False), located, ORIGIN, 0.01, gps(5.0, -height_m), "EXIF")
+    assert read.enu(ORIGIN) == pytest.approx(places, abs=1e-3)
+    assert "nothing tells" in note
+    read, _ = with_height_unit(list_of(places, True), located, ORIGIN, 0.01, gps(5.0, 60.0), "EXIF")
+    assert read.enu(ORIGIN) == pytest.approx(places, abs=1e-3)
+
+
 def test_a_bent_model_of_the_other_shape_decides_nothing_against_gps():
     """A hollow that the model shows as deep as the wrong unit has it."""
     places = surveyed(6, 0.0, 290.0, np.random.default_rng(2))

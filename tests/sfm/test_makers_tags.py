@@ -131,7 +131,7 @@ def test_attitudes_under_rarer_names(attributes, elements, expected):
     [
         ('drone-yuneec:GPSAltitude="201.02" drone-yuneec:AboveHomeAltitude="69.84"', 69.84),
         ('FLIR:MAVRelativeAltitude="69500/1000"', 69.5),
-        ('FLIR:MAVRelativeAltitude="0/1000"', None),
+        ('FLIR:MAVRelativeAltitude="0/1000"', 0.0),
         ('Camera:AboveGroundAltitude="69.5"', None),  # over the ground below, not over the take-off
     ],
 )

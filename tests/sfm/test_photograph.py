@@ -332,6 +332,15 @@ def test_the_height_over_the_median_point_is_compared_where_views_show_the_groun
     assert bool(found) == said
 
 
+@pytest.mark.parametrize(("height", "said"), [(9.0, True), (98.0, True), (15.0, False)])
+def test_heights_by_control_points_that_differ_as_feet_do_are_asked_about(height, said):
+    """Over a roof they may be right."""
+    [note] = _warnings((), (True, ""), height, recorded=30.0, turned=None, tilt=5.0, surveyed="gcp.txt")
+    assert ("gcp.txt: Are they in feet" in note) == said
+    assert "feet" not in _warnings((), (True, ""), height, recorded=30.0, turned=None, tilt=5.0)[0]
+    assert not _warnings((), (True, ""), height, recorded=30.0, turned=None, tilt=88.0, surveyed="gcp.txt")
+
+
 @pytest.mark.parametrize(
     ("why", "recorded", "said", "held"),
     [

@@ -104,7 +104,8 @@ def test_a_table_given_afterwards_moves_the_finished_capture(nine, capture, tmp_
 def test_positions_of_half_of_the_photographs_place_all(nine, capture, tmp_path, altitudes, monkeypatch):
     rows = table(tmp_path / "gps.csv", nine).read_text().splitlines()[:1:-2]
     if not altitudes:
-        monkeypatch.setattr(gps_priors, "_altitude_beside", lambda photo: (np.nan, ""))
+        monkeypatch.setattr(gps_priors, "_or_nan", lambda value: np.nan)
+        monkeypatch.setattr(gps_priors, "with_take_off_heights", lambda places, kinds, photos: (places, kinds, []))
     lines = rows if altitudes else [row.rpartition(",")[0] for row in rows]
     (tmp_path / "gps.csv").write_text("\n".join(["name,lat,lon,alt" if altitudes else "name,lat,lon", *lines]))
     facts, said = again(nine, capture, tmp_path / "gps.csv")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from support.flown_models import FOCAL, HEIGHT, WIDTH, flown_model
+from vdgs.captures.position_adjustment import Problem, Up
 from vdgs.captures.reconstruction import OVER_GROUND, OVER_MEDIAN, AccuracyFacts
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.geometry.similarity import Similarity
@@ -35,7 +36,16 @@ from vdgs.sfm.image_list import ImageList
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reconstruction_report import _advice, _flown_heights, _relief_explains, focal_reason
-from vdgs.sfm.view_stretch import SAID_SHARE, Known, Stretch, factor_of_heights, stretched, with_stretch
+from vdgs.sfm.view_stretch import (
+    SAID_SHARE,
+    Known,
+    Stretch,
+    _by_heights,
+    _Flown,
+    factor_of_heights,
+    stretched,
+    with_stretch,
+)
 from vdgs.system.lazy_pycolmap import pycolmap
 
 pytestmark = pytest.mark.slow
@@ -265,3 +275,22 @@ def test_the_advice_promises_nothing_of_a_second_height_but_what_recorded_height
     assert "oblique views" in advice
     assert "by the recorded heights alone" in advice
     assert not _advice(look, False, 10, 10)
+
+
+@pytest.mark.parametrize("without", [(), (0,), (3, 4, 9)])
+def test_heights_over_the_take_off_of_most_photographs_tell_the_factor(without):
+    """Of a model whose heights differ 3 % less than they should."""
+    places, up = two_heights(), Up(np.array([0.0, 0.0, 1.0]), 0.3, "")
+    taken = [
+        SimpleNamespace(name=f"{k}", camera="", datetime="", subsecond=None,
+                        relative_altitude=None if k in without else height)
+        for k, height in enumerate(places[:, 2].tolist())
+    ]  # fmt: skip
+    problem = Problem(centers=places, targets=places, times=np.zeros(len(places)), up=up, has_altitudes=False)
+    plane = SimpleNamespace(inliers=np.ones(len(places), bool), placed=places * [1, 1, 1 / 1.03])
+    zeros = np.zeros(len(places))
+    known = _by_heights(_Flown(problem, plane, np.array([0.0, 0.0, -1.0]), taken, zeros, zeros))
+    assert known.log == pytest.approx(math.log(1.03), abs=0.003)
+    for photo in taken[1:]:
+        photo.relative_altitude = None
+    assert _by_heights(_Flown(problem, plane, np.array([0.0, 0.0, -1.0]), taken, zeros, zeros)) is None

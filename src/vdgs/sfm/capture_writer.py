@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +22,7 @@ from vdgs.captures.pinholes import folds_to_nothing, undistorted_pinhole
 from vdgs.captures.undistortion import encode_jpeg, sampling_map
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
+from vdgs.sfm.focal_length import AGREE, MAX_FOCAL
 from vdgs.sfm.mask_files import encode_mask, undistort_mask
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import read_json_or_empty, write_bytes, write_json
@@ -34,6 +35,8 @@ SIDE_MULTIPLE = 4
 IMAGE_SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
 #: No perspective lens sees more degrees from corner to corner: those of 9 mm for 36 x 24 mm see 135.
 WIDEST_DEG = 138.0
+#: COLMAP's limits of focal lengths over the longer side; and the longest by tags, fitted a little longer: of a zoom.
+SHORTEST, LONGEST, LONGEST_BY_TAGS = 0.1, 10.0, AGREE * MAX_FOCAL
 #: The folder of masks, of the largest size.
 MASK_FOLDER = CaptureOptions.masks
 IMAGE_FOLDERS = (*(folder for folder, _ in IMAGE_SIZES), MASK_FOLDER)
@@ -258,8 +261,15 @@ def _is_of_rig(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
 
 def is_impossible(camera: pycolmap.Camera) -> bool:
     """Whether there is no such lens."""
-    bogus = not camera.verify_params() or camera.has_bogus_params(0.1, 10.0, 1.0)
+    bogus = not camera.verify_params() or camera.has_bogus_params(SHORTEST, LONGEST_BY_TAGS, 1.0)
     return bogus or _perspective_deg(camera) > WIDEST_DEG or folds_to_nothing(lens_of(camera))
+
+
+def longest_focal(cameras: Iterable[pycolmap.Camera]) -> float:
+    """The longest focal length over the longer side that a mapper should believe: COLMAP's limit, but where tags say
+    one that may be fitted beyond it."""
+    told = [each.mean_focal_length() / max(each.width, each.height) for each in cameras if each.has_prior_focal_length]
+    return LONGEST_BY_TAGS if AGREE * max(told, default=0.0) > LONGEST else LONGEST
 
 
 def _perspective_deg(camera: pycolmap.Camera) -> float:

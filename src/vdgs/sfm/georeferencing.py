@@ -23,7 +23,17 @@ from vdgs.sfm.bending import bend_to_positions, tell_level
 from vdgs.sfm.focal_decision import OF_LENSES
 from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
-from vdgs.sfm.height_units import GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M, of_gps, with_height_unit
+from vdgs.sfm.gps_priors import GpsPriors
+from vdgs.sfm.height_units import (
+    GPS_ACROSS_M,
+    GPS_UP_M,
+    HEIGHTS_M,
+    IN_FEET,
+    are_in_feet,
+    in_feet,
+    of_gps,
+    with_height_unit,
+)
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.reconstruction_plan import ReconstructionPlan
 from vdgs.sfm.reprojection import drop_unseen_observations
@@ -42,8 +52,6 @@ MOST_OFF = 0.1
 MOST_TILTED_DEG = 60.0
 #: Scales that differ by so much (share) beside what they may be wrong by contradict each other (choice).
 SCALES_APART = 0.1
-#: A ratio so near to that of feet and metres is one (share).
-ABOUT = 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,15 +216,8 @@ def _refuse_another_scale(scale: tuple[float, float], alone: Georegistration, pr
         raise CaptureError(
             f"{prepared.scale_bars.source}: its distances make the scene {ratio:.3g} times as large as the positions "
             f"({prepared.gps_priors.source}) do, which are good to ±{alone.accuracy.scale_percent:.2g} %."
-            f"{_in_feet(ratio)} Mend it, or leave the positions out: --georeference off"
+            f"{in_feet(ratio)} Mend it, or leave the positions out: --georeference off"
         )
-
-
-def _in_feet(ratio: float) -> str:
-    for feet in (FOOT_M, 1 / FOOT_M):
-        if abs(ratio / feet - 1) < ABOUT:
-            return " Are they in feet, where metres are expected?"
-    return ""
 
 
 def _bent(
@@ -271,8 +272,11 @@ def _by_control(
     if prepared.scale_bars is not None:
         factor, _ = known_scale(found.model, prepared.scale_bars)
         notes += (f"the distances of {prepared.scale_bars.source} are {1 / factor:.2%} of what they should be.",)
+    positions = prepared.gps_priors
+    if positions.over_take_off and control.has_heights:  # which tell nothing of heights over the sea
+        positions = replace(positions, has_altitudes=False)
     placed = georegistration.registration_in_place(
-        found.model, photographs, prepared.gps_priors, found.how, found.accuracy, notes
+        found.model, photographs, positions, found.how, found.accuracy, notes
     )
     placed = replace(placed, notes=(*notes, *of_gps(placed, gps, control.source, doubts.gps)))
     return found.model, placed, found.doubtful
@@ -285,11 +289,8 @@ class Doubts:
     up: Up
     centers: np.ndarray
     """Of the cameras, in the model's world."""
-    ground: np.ndarray
-    """Points of the model."""
     by_gps: Georegistration | None
     gps: str
-    recorded_height_m: float | None
     altitude: float
     """Of the origin that metres up count from."""
 
@@ -303,10 +304,8 @@ class Doubts:
         return cls(
             up=up_of(model, photographs)[0],
             centers=model_centers(model),
-            ground=model_points(model),
-            by_gps=by_gps if isinstance(by_gps, Georegistration) else None,
+            by_gps=_at_sea(by_gps, positions) if isinstance(by_gps, Georegistration) else None,
             gps=positions.source,
-            recorded_height_m=prepared.preflight.height_m,
             altitude=prepared.origin[2],
         )
 
@@ -316,7 +315,6 @@ class Doubts:
             self._of_hands(similarity, places, targets)
             or self._of_fit(similarity, places, targets)
             or self._of_gps(similarity, targets)
-            or self._of_height(similarity)
         )
 
     def _of_hands(self, similarity: Similarity, places: np.ndarray, targets: np.ndarray) -> str:
@@ -351,7 +349,7 @@ class Doubts:
         if abs(math.log(ratio)) > SCALES_APART + (accuracy.scale_percent or 0.0) / 100:
             return (
                 f"its points make the scene {ratio:.3g} times as large as GPS ({self.gps}) does, which is good to "
-                f"±{accuracy.scale_percent:.2g} %.{_in_feet(ratio)}"
+                f"±{accuracy.scale_percent:.2g} %.{in_feet(ratio)}"
             )
         off = np.median(similarity.apply(self.centers) - gps.apply(self.centers), axis=0)
         across = float(np.hypot(off[0], off[1]))
@@ -363,11 +361,11 @@ class Doubts:
         height = float(np.median(targets[:, 2]))
         level = float(np.median(targets[:, 2]) - off[2])
         if error_up and abs(off[2]) > GPS_UP_M + error_up[0]:
-            feet = abs(self._altitude_off_in_feet(height, level)) < 0.5 * abs(off[2])
+            feet = are_in_feet(float(off[2]), self._altitude_off_in_feet(height, level), error_up[0])
             if feet or abs(off[2]) > HEIGHTS_M:
                 return (
                     f"its heights are {_distance(abs(float(off[2])))} {'over' if off[2] > 0 else 'under'} those of GPS "
-                    f"({self.gps}).{' Are they in feet, where metres are expected?' if feet else ' Are they metres?'}"
+                    f"({self.gps}).{IN_FEET if feet else ' Are they metres?'}"
                 )
         return ""
 
@@ -375,17 +373,13 @@ class Doubts:
         """How far heights would be from those of GPS if they were in feet; heights here count from the origin."""
         return FOOT_M * (height + self.altitude) - (level + self.altitude)
 
-    def _of_height(self, similarity: Similarity) -> str:
-        if self.by_gps is not None or not self.recorded_height_m:
-            return ""
-        height = float(np.median(similarity.apply(self.centers)[:, 2]) - np.median(similarity.apply(self.ground)[:, 2]))
-        ratio = height / self.recorded_height_m
-        if _in_feet(ratio):
-            return (
-                f"placed by it the cameras are {height:.0f} m over the ground, the drone recorded "
-                f"{self.recorded_height_m:.0f} m over its take-off.{_in_feet(ratio)}"
-            )
-        return ""
+
+def _at_sea(placed: Georegistration, positions: GpsPriors) -> Georegistration:
+    """The same without an accuracy up where heights count from the take-off: they say nothing against heights over the
+    sea."""
+    if not positions.over_take_off or placed.accuracy is None or placed.accuracy.place_m is None:
+        return placed
+    return replace(placed, accuracy=replace(placed.accuracy, place_m=placed.accuracy.place_m[:1]))
 
 
 def _distance(meters: float) -> str:

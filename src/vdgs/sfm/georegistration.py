@@ -17,11 +17,13 @@ from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity
 from vdgs.sfm.attitude_tilt import are_turned_over
+from vdgs.sfm.barometer_fit import fit_by_barometer
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
 from vdgs.sfm.position_lines import are_along_a_line
 from vdgs.sfm.recorded_headings import checked_by_headings
+from vdgs.sfm.take_off_heights import recorded_heights
 from vdgs.sfm.up_direction import camera_rotation, up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
@@ -308,18 +310,8 @@ def _best_fit(problem: Problem, taken: Sequence[ImageMetadata]) -> tuple[Positio
     fit = fit_positions(problem)
     over_ground = problem.has_altitudes and fit.altitude == "none"
     problem = replace(problem, has_altitudes=problem.has_altitudes and not over_ground)
-    relative = np.array([np.nan if photo.relative_altitude is None else photo.relative_altitude for photo in taken])
-    if fit.altitude == "used" or not np.isfinite(relative).all() or np.ptp(relative) == 0:
-        return fit, False, over_ground
-    targets = problem.targets.copy()
-    targets[:, 2] = relative + np.median(targets[:, 2] - relative)
-    steady = fit_positions(replace(problem, targets=targets, has_altitudes=True))
-    if steady.altitude != "used" or (problem.has_altitudes and steady.score >= fit.score):
-        return fit, False, over_ground
-    if problem.has_altitudes:  # they alone say how high the take-off is, with all of their drift
-        across, up = steady.place_error_m
-        steady = replace(steady, place_error_m=(across, max(up, fit.place_error_m[1])), drift_m=fit.drift_m)
-    return steady, True, over_ground
+    steady = None if fit.altitude == "used" else fit_by_barometer(problem, fit, recorded_heights(taken))
+    return (fit, False, over_ground) if steady is None else (steady, True, over_ground)
 
 
 def _unit(fit: PositionFit, problem: Problem, positions: GpsPriors) -> str:

@@ -26,7 +26,7 @@ from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.similarity import nearest_rotation
 from vdgs.sfm import feature_matching, incremental_mapper
-from vdgs.sfm.capture_writer import placed_images
+from vdgs.sfm.capture_writer import longest_focal, placed_images
 from vdgs.sfm.image_metadata import EXACT_MODEL
 from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.turning import only_turns
@@ -161,6 +161,8 @@ def map_globally(database: Path, images: Path, output: Path, threads: int, fix_f
     adjustment.refine_focal_length = not fix_focal
     options.mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
     options.mapper.retriangulation.ignore_two_view_tracks = False
+    with pycolmap.Database.open(database) as lenses:
+        options.mapper.retriangulation.max_focal_length_ratio = longest_focal(lenses.read_all_cameras())
     (output / _BEGUN).touch()
     pycolmap.global_mapping(database, images, output, options)
 

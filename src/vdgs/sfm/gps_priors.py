@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from vdgs.geometry.geodesy import enu_from_geodetic, median_place, wrap_degrees
 from vdgs.sfm.exif_gps import BY_MAKER, IN_EXIF
 from vdgs.sfm.flights import STEP_M, flights_of
 from vdgs.sfm.image_metadata import ImageMetadata
+from vdgs.sfm.take_off_heights import OVER_KNOWN_TAKE_OFF, OVER_TAKE_OFF, with_take_off_heights
 from vdgs.system.units import first_names
 
 #: A table whose positions are this near to those in the photographs is of the same flight (degrees).
@@ -65,6 +66,8 @@ class GpsPriors:
     """What people should know: positions left out, and why."""
     has_altitudes: bool = True
     """False where most positions have none: then heights here are 0, and positions count in the plane alone."""
+    over_take_off: bool = False
+    """Whether some heights count from the take-off: then they say nothing of the sea."""
     flights: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Numbers [m] of the flights of the positions, whose altitudes may differ by a datum; empty where none is told."""
     datum_errors_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -115,7 +118,8 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
     geodetic, notes = recorded.geodetic, recorded.notes
     names = [photo.name for photo in photographs]
     known = _of_one_flight(geodetic, notes) & _of_one_place(geodetic, names, notes)
-    geodetic, kept, has_altitudes = _in_space_or_plane(geodetic, known, names, notes)
+    over_take_off = np.isin(recorded.kinds, (OVER_TAKE_OFF, OVER_KNOWN_TAKE_OFF))
+    geodetic, kept, has_altitudes = _in_space_or_plane(geodetic, known, over_take_off, names, notes)
     index = np.flatnonzero(kept)
     origin = _origin(geodetic[index])
     enu = enu_from_geodetic(geodetic[index], origin) if len(index) else np.zeros((0, 3))
@@ -149,6 +153,7 @@ def read_gps_priors(photographs: Sequence[ImageMetadata], table: Path | None, st
         source=recorded.source,
         notes=tuple(notes),
         has_altitudes=has_altitudes,
+        over_take_off=OVER_TAKE_OFF in kinds,
         flights=flights_of(taken, of_each, heights),
         altitude_step_m=step,
         table=table if any(np.isfinite(row.position[2]) for row in recorded.rows.values()) else None,
@@ -205,10 +210,12 @@ def _altitude_step(altitudes: np.ndarray) -> float:
 
 
 def _in_space_or_plane(
-    geodetic: np.ndarray, known: np.ndarray, names: Sequence[str], notes: list[str]
+    geodetic: np.ndarray, known: np.ndarray, over_take_off: np.ndarray, names: Sequence[str], notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Positions [n, 3], which are used [n] bool, and whether with their altitudes (0 where not); says so in notes."""
-    geodetic = without_zero_altitudes(geodetic, known)
+    """Positions [n, 3], which are used [n] bool, and whether with their altitudes (0 where not); says so in notes.
+    Heights of 0 `over_take_off` [n] bool are no defaults: on the ground."""
+    believed = without_zero_altitudes(geodetic, known & ~over_take_off)
+    geodetic = np.where(over_take_off[:, None], geodetic, believed)
     kept, has_altitudes = with_altitudes(geodetic[:, 2], known)
     if not has_altitudes:
         without = known & ~np.isfinite(geodetic[:, 2])
@@ -229,7 +236,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
         geodetic = np.array([(*(photo.lat_lon or (np.nan, np.nan)), _or_nan(photo.altitude)) for photo in photographs])
         kinds = [photo.altitude_type for photo in photographs]
         kinds = [IN_EXIF if kind == BY_MAKER and IN_EXIF in kinds else kind for kind in kinds]
-        return _without_default_altitudes(_Recorded(geodetic.reshape(-1, 3), kinds, "EXIF", [], {}), photographs)
+        return _with_heights(_Recorded(geodetic.reshape(-1, 3), kinds, "EXIF", [], {}), photographs)
     read = read_gps_table(table)
     names = [photo.name for photo in photographs]
     rows = match_rows(names, read.rows, table, read.numbered)
@@ -237,7 +244,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
     for index, row in rows.items():
         geodetic[index], kinds[index] = row.position, f"as in {table.name}"
         if not np.isfinite(row.position[2]):
-            geodetic[index, 2], kinds[index] = _altitude_beside(photographs[index])
+            geodetic[index, 2], kinds[index] = _or_nan(photographs[index].altitude), photographs[index].altitude_type
     notes = [*read.notes, *_unmatched(read.rows, rows, table), *_far_off(geodetic, photographs, table)]
     notes += _beside(rows, photographs, table, read.datum_error_m)
     notes += _other_altitudes(rows, photographs, table)
@@ -245,21 +252,16 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
     if without:
         chosen = np.isin(np.arange(len(names)), without)
         notes.append(f"{table.name} gives no altitude for {_some(names, chosen)}; as the photographs say it.")
-    return _Recorded(geodetic, kinds, table.name, notes, rows, read.datum_error_m)
+    found = _Recorded(geodetic, kinds, table.name, notes, rows, read.datum_error_m)
+    return _with_heights(found, photographs) if without else found
 
 
-def _without_default_altitudes(recorded: _Recorded, photographs: Sequence[ImageMetadata]) -> _Recorded:
-    """Where no altitude is known (all exactly 0 are those of a program that knew none), heights over the take-off."""
-    known = np.isfinite(recorded.geodetic[:, :2]).all(axis=1)
-    heights = np.array([_or_nan(photo.relative_altitude) for photo in photographs])
-    altitudes = np.nan_to_num(recorded.geodetic[known, 2])
-    if known.sum() < MIN_POSITIONS or altitudes.any() or not np.isfinite(heights[known]).all():
+def _with_heights(recorded: _Recorded, photographs: Sequence[ImageMetadata]) -> _Recorded:
+    """With heights over the take-off for flights without altitudes (`with_take_off_heights`)."""
+    if np.isfinite(recorded.geodetic[:, :2]).all(axis=1).sum() < MIN_POSITIONS:
         return recorded
-    geodetic = recorded.geodetic.copy()
-    geodetic[known, 2] = heights[known]
-    kinds = ["above the take-off, by XMP" if known[k] else kind for k, kind in enumerate(recorded.kinds)]
-    notes = ["EXIF has no altitudes, or exactly 0 (a default); heights over the take-off are used."]
-    return _Recorded(geodetic, kinds, recorded.source, notes, {})
+    geodetic, kinds, notes = with_take_off_heights(recorded.geodetic, recorded.kinds, photographs)
+    return replace(recorded, geodetic=geodetic, kinds=kinds, notes=[*recorded.notes, *notes])
 
 
 def _far_off(geodetic: np.ndarray, photographs: Sequence[ImageMetadata], table: Path) -> list[str]:
@@ -348,13 +350,6 @@ def _other_altitudes(rows: Mapping[int, GpsRow], photographs: Sequence[ImageMeta
         f"{table.name}: its altitudes lie {abs(off):,.0f} m {way} those in the photographs, "
         "and are used all the same. Over the ground, in feet, or over another zero (the ellipsoid's)?"
     ]
-
-
-def _altitude_beside(photo: ImageMetadata) -> tuple[float, str]:
-    """What a photograph itself says of its altitude, and what it is measured from."""
-    if photo.altitude is not None:
-        return photo.altitude, photo.altitude_type
-    return _or_nan(photo.relative_altitude), "above the take-off, by XMP"
 
 
 def _or_nan(value: float | None) -> float:

@@ -18,6 +18,13 @@ from vdgs.sfm.georegistration import Georegistration
 
 #: GPS is wrong by no more than this many metres across and, geoids among it, up; no heights by more than the last.
 GPS_ACROSS_M, GPS_UP_M, HEIGHTS_M = 100.0, 150.0, 1000.0
+#: Heights in feet lie as far from those of GPS, once they are read as such, as it is off and geoids are from the
+#: ellipsoid where people count in feet (metres); and by less than this share of how far they lie as metres: heights of
+#: a GPS that begin at 0 lie 30 % (choices).
+GEOIDS_M, FEET_SHARE = 60.0, 0.25
+#: A ratio so near to that of feet and metres is one (share).
+ABOUT = 0.12
+IN_FEET = " Are they in feet, where metres are expected?"
 #: One unit explains points and photographs so many times as well (logarithm of likelihoods; choice).
 PLAINLY_BETTER = math.log(1000.0)
 #: Heights contradict GPS so many times as far from it as GPS is good to (95 %; choice).
@@ -104,12 +111,24 @@ def by_gps(places: np.ndarray, meters: np.ndarray, feet: np.ndarray, gps: Georeg
     as_meters, as_feet = (float(np.median(targets[:, 2] - heights)) for targets in (meters, feet))
     for near, far in ((good, CONTRADICTING * good), (GPS_UP_M + good, GPS_UP_M + CONTRADICTING * good)):
         fits = [abs(off) <= near for off in (as_meters, as_feet)]
+        fits[1] = fits[1] and (near == good or abs(as_feet) <= FEET_SHARE * abs(as_meters))
         contradicts = [abs(off) > far for off in (as_meters, as_feet)]
         if (fits[1] and contradicts[0]) or (fits[0] and contradicts[1]):
             side = "over" if as_meters > 0 else "under"
             why = f"as metres they are {abs(as_meters):.3g} m {side} those of GPS ({source}), good to ±{good:.2g} m"
             return Found(fits[1], why)
     return Found(None)
+
+
+def are_in_feet(as_meters: float, as_feet: float, good: float) -> bool:
+    """Whether heights are plainly in feet that lie so far from those of GPS as metres, and so far as feet; GPS is good
+    to `good`. All in metres."""
+    return abs(as_feet) <= min(GEOIDS_M + good, FEET_SHARE * abs(as_meters))
+
+
+def in_feet(ratio: float) -> str:
+    """A question where lengths are so many times as long as they should be; empty where feet do not explain that."""
+    return IN_FEET if any(abs(ratio / feet - 1) < ABOUT for feet in (FOOT_M, 1 / FOOT_M)) else ""
 
 
 def _ways_to_say(control: GcpList) -> str:

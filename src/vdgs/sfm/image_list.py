@@ -38,6 +38,7 @@ from vdgs.sfm.photograph_versions import taken_apart
 from vdgs.sfm.rig_folders import with_sensors
 from vdgs.sfm.serial_numbers import without_odd_serials
 from vdgs.sfm.sidecars import list_folder, with_sidecars
+from vdgs.sfm.take_off_heights import without_default_heights
 from vdgs.sfm.used_bands import unused_bands
 from vdgs.system.content_digests import find_copies
 from vdgs.system.quoting import shell_word
@@ -166,7 +167,7 @@ def _chosen(photographs: list[ImageMetadata], camera_model: CameraModel, bracket
     exposures, bracketed = unused_exposures(photographs) if brackets == "middle" else ({}, [])
     unused |= exposures
     photographs, lone = _with_models([photo for photo in photographs if photo.name not in exposures], camera_model)
-    photographs, rigs = with_sensors(photographs)
+    photographs, rigs = with_sensors(without_default_heights(photographs))
     left_out = [*doubled, *strange, *lone, *(ExcludedImage(name, why) for name, why in unused.items())]
     return _Chosen(photographs, left_out, [*odd_serials, *spectral, *bracketed, *rigs])
 

@@ -204,7 +204,7 @@ class ImageMetadata:
     gps_error_m: float | None
     """How far the place may be off across, in metres, where EXIF says it (GPSHPositioningError)."""
     relative_altitude: float | None
-    """In metres; 0 is what drones write that do not know it."""
+    """In metres; all of a flight are 0 of drones that do not know it (`without_default_heights`)."""
     attitude: Attitude | None
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
     file_bytes: int
@@ -350,7 +350,7 @@ def read_image_metadata(path: Path, name: str) -> ImageMetadata:
         gps_error_m=_gps_error(gps),
         datum_error_m=datum_error_m,
         fix="" if in_xmp else read_fix(gps),
-        relative_altitude=first_number(xmp, *_OVER_TAKE_OFF) or None,
+        relative_altitude=first_number(xmp, *_OVER_TAKE_OFF),
         attitude=likeliest_attitude(attitudes),
         attitudes=attitudes if len(attitudes) > 1 else {},
         file_bytes=size,

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from vdgs.captures.formats.colmap_writing import check_whole_model, write_model_files
 from vdgs.errors import CaptureError
-from vdgs.sfm.capture_writer import placed_images
+from vdgs.sfm.capture_writer import longest_focal, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup
 from vdgs.sfm.image_metadata import EXACT_MODEL
 from vdgs.sfm.reprojection import drop_unseen_observations
@@ -46,8 +46,10 @@ def run_mapper(workspace: Workspace, count: int, fix_focal: bool, threads: int, 
         folder.mkdir(parents=True)
     options = _options(fix_focal, threads)
     with workspace.open_database() as database:
-        exact = {camera.camera_id for camera in database.read_all_cameras() if camera.model_name == EXACT_MODEL}
+        cameras = database.read_all_cameras()
+        exact = {camera.camera_id for camera in cameras if camera.model_name == EXACT_MODEL}
         rigs = [rig for rig in database.read_all_rigs() if rig.ref_sensor_id.id in exact]
+    options.max_focal_length_ratio = longest_focal(cameras)
     options.constant_cameras = options.mapper.constant_cameras = exact
     options.constant_rigs = options.mapper.constant_rigs = {rig.rig_id for rig in rigs}
     options.snapshot_path, options.snapshot_frames_freq = (

@@ -262,6 +262,7 @@ def _triangulate(
     folder.mkdir(parents=True)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.extract_colors = threads, 0, False
+    options.max_focal_length_ratio = options.triangulation.max_focal_length_ratio = capture_writer.LONGEST_BY_TAGS
     options.triangulation.ignore_two_view_tracks = False  # as in the mapper: edges of a flight have no others
     with report_progress(work, console, "mapping", len(photographs.views), "poses held, ") as tell:
         tell(0)

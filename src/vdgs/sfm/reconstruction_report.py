@@ -31,6 +31,7 @@ from vdgs.sfm.gcp_list import GcpList
 from vdgs.sfm.georeferencing import Georeferenced
 from vdgs.sfm.georegistration import AlignmentFailure, Georegistration
 from vdgs.sfm.gps_priors import ALTITUDE_UNKNOWN, GpsPriors
+from vdgs.sfm.height_units import in_feet
 from vdgs.sfm.image_list import MIN_IMAGES, ExcludedImage, ImageList
 from vdgs.sfm.image_metadata import RADIAL, ImageMetadata
 from vdgs.sfm.incremental_mapper import refined_cameras
@@ -99,11 +100,13 @@ def make_reconstruction_report(plan: ReconstructionPlan, result: ReconstructionR
     cameras = cameras_of(model, result.camera_groups)
     turned = tilt_from_attitudes(model, result.found.photographs) if metric else None
     recorded = None if height is None or _relief_explains(model, images, look.height_m) else look.height_m
+    control = result.found.control
+    surveyed = control.source if control is not None and control.has_control_points else ""
     untold = {kind.camera for kind in result.camera_groups if kind.model == RADIAL}
     warnings = [
         *look.warnings,
         *result.found.notes,
-        *_warnings(cameras, held, height, recorded, turned, tilt, untold),
+        *_warnings(cameras, held, height, recorded, turned, tilt, untold, surveyed),
     ]
     if placed is not None and height is not None and placed.residuals.shape[1] == 3:  # positions with altitudes
         up = placed.residuals[:, 2]
@@ -320,7 +323,9 @@ def _warnings(
     turned: float | None,
     tilt: float | None,
     untold: Collection[str] = (),
+    surveyed: str = "",
 ) -> list[str]:
+    """`surveyed`: the list of control points that places the cameras; empty where none does."""
     found = []
     for camera in cameras:
         if camera.is_fisheye and camera.name in untold:
@@ -356,6 +361,7 @@ def _warnings(
         found.append(
             f"the cameras are {height:.1f} m over the median point, the drone recorded {recorded:.1f} m over its "
             "take-off: another level of ground, or a focal length that is not right."
+            + (f" {surveyed}:{in_feet(height / recorded)}" if surveyed and in_feet(height / recorded) else "")
         )
     if turned is not None and turned > MAX_TILT_DEG:
         found.append(f"down differs by {turned:.1f}° from what the drone recorded: the model may be tilted or bent.")

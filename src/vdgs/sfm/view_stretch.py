@@ -25,6 +25,7 @@ from vdgs.sfm.georegistration import Georegistration, match_positions, problem_o
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import EXACT_MODEL, ImageMetadata
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
+from vdgs.sfm.take_off_heights import recorded_heights
 from vdgs.sfm.up_direction import up_of
 from vdgs.system.lazy_pycolmap import pycolmap
 from vdgs.system.units import two_digits
@@ -255,10 +256,13 @@ def _by_heights(flown: _Flown) -> Known | None:
         apart = min(DRIFT_M, max(said, APART_ACROSS * float(flown.plane.gps_std[:2].mean())))
         off = flown.problem.targets[:, 2] - heights
         found.append(factor_of_heights(places, off[inside], of_flight[inside], tilt, apart))
-    recorded = [math.nan if photo.relative_altitude is None else photo.relative_altitude for photo in flown.taken]
-    relative = np.array(recorded, float)
-    if np.isfinite(relative).all() and np.ptp(relative):
-        known = factor_of_heights(places, (relative - heights)[inside], flights[inside], tilt, BAROMETER_M)
+    relative = recorded_heights(flown.taken)
+    recorded = np.isfinite(relative)
+    if 2 * recorded.sum() >= len(recorded) and np.ptp(relative[recorded]):
+        which = inside & recorded
+        known = factor_of_heights(
+            flown.plane.placed[which], (relative - heights)[which], flights[which], tilt, BAROMETER_M
+        )
         found.append(Known(known.log, math.hypot(known.deviation, BAROMETER_SHARE), BY_BAROMETER))
     return _joined(found)
 

@@ -255,8 +255,10 @@ def _created(tags: dict[str, str]) -> datetime | None:
 
 
 def _start_place(tags: dict[str, str]) -> tuple[float, float] | None:
-    found = next((match for key in _PLACE_KEYS if (match := _ISO6709.match(tags.get(key.lower(), "")))), None)
-    return (float(found[1]), float(found[2])) if found else None
+    """Latitude and longitude in degrees; None where no tag says them, or only 0, 0: without a fix."""
+    found = (_ISO6709.match(tags.get(key.lower(), "")) for key in _PLACE_KEYS)
+    places = ((float(match[1]), float(match[2])) for match in found if match)
+    return next((place for place in places if any(place)), None)
 
 
 def gray_picture(picture: Any, width: int) -> UInt8[np.ndarray, "h w"]:
