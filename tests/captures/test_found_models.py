@@ -7,7 +7,6 @@ import re
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -400,24 +399,7 @@ def test_units_are_never_told_by_where_a_set_lies(tmp_path, scene, place):
     assert ground.scale == pytest.approx(1, abs=0.1)  # the median camera height is 10 units
 
 
-# ------------------------------------------------------------------------------------------------- masks
-
-
-@pytest.mark.parametrize(
-    "named",
-    ["masks/{}.png", "mask/{}.png", "_masks/{}_mask.png", "images/{}_mask.png", "images/{}.png.png", "masks_4/{}.png"],
-)
-def test_masks_of_a_capture_have_any_usual_name(tmp_path, scene, named):
-    write_colmap(tmp_path, scene)
-    for name, camera in scene.cameras.items():
-        keep = np.ones((camera.height, camera.width), np.uint8)
-        keep[:10] = 0
-        file = tmp_path / named.format(name.removesuffix(".png"))
-        file.parent.mkdir(exist_ok=True)
-        assert cv2.imwrite(str(file), keep)
-    capture = load_capture(tmp_path)
-    assert all(view.mask_path is not None for view in capture.views)
-    assert not any("no camera" in warning for warning in capture.warnings)
+# ---------------------------------------------------------------------------------------------- photographs
 
 
 def test_thumbnails_of_a_system_are_no_images_of_a_capture(tmp_path, scene):

@@ -172,6 +172,47 @@ def test_flights_have_their_up_against_the_view(scene):
         assert warnings == []
 
 
+def at_one_height(scene: Scene) -> Scene:
+    """All cameras as high as the highest."""
+    centers, rotations, points = scene
+    return np.column_stack([centers[:, :2], np.full(len(centers), centers[:, 2].max())]), rotations, points
+
+
+@pytest.mark.parametrize("scene", [
+    pytest.param(flight([0, 180], -90, (1, 1, 2), slope=10), id="back and forth"),
+    pytest.param(flight([0, 180, 180], -80, (1, 1, 2), slope=20), id="tilted, more of them back"),
+    pytest.param(flight([0, 90], -85, (1, 1, 3), slope=30), id="crossing"),
+    pytest.param(flight([0, 90, 180, 270], -65, (1, 1, 1), slope=20), id="oblique"),
+    pytest.param(at_one_height(flight([0, 180], -90, (1, 1, 2), slope=20)), id="level flight"),
+])  # fmt: skip
+def test_flights_over_slopes_have_the_axis_up_that_their_cameras_turn_about(scene):
+    for turn in turns():
+        angle, warnings = off_by(scene, turn)
+        assert angle < 1
+        assert warnings == []
+
+
+@pytest.mark.parametrize("seed", [24, 51, 74])
+def test_a_few_photographs_from_an_unsteady_hand_do_not_lean_a_flight_over_flat_ground(seed):
+    """Five may hang alike by chance about another axis."""
+    generator = np.random.default_rng(seed)
+    centers, rotations, points = flight([0, 180], -90, (0, 0, 0))
+    some = generator.permutation(len(centers))[:5]
+    off = np.radians(generator.normal(0, 5, (5, 3)))
+    rotations = np.stack([cv2.Rodrigues(turn)[0] @ each for turn, each in zip(off, rotations[some], strict=True)])
+    assert off_by((centers[some], rotations, points), np.eye(3))[0] < 2
+
+
+@pytest.mark.parametrize("pitch", [-70, -45, -5])
+def test_photographs_that_look_one_way_do_not_lean_a_flight_over_flat_ground(pitch):
+    """A third of them, beside others that look straight down: these do not hang alike."""
+    centers, rotations, points = flight([0, 180], -90, (1, 1, 2))
+    aside = cameras(centers[::3], 30.0, pitch, (1, 1, 2))
+    both = np.concatenate([centers, aside[0] + [0, 0, 1]]), np.concatenate([rotations, aside[1]]), points
+    for turn in turns():
+        assert off_by(both, turn)[0] < 1
+
+
 @pytest.mark.parametrize("slope", [0.0, 20.0])
 def test_flights_of_one_heading_that_never_yaw_are_as_flat_as_their_ground(slope):
     for turn in turns():

@@ -187,10 +187,10 @@ def find_mask(folder: Path, name: str) -> Path | None:
 
 
 def find_mask_beside(folder: Path, name: str, image: Path | None = None) -> Path | None:
-    """The mask of an image in the image's own folder: name.jpg.png or `name_mask` and its like. The `image` itself is
-    none, as it would be of a name without extension."""
+    """The mask of an image in the image's own folder: name.jpg.png, `mask_name`, or `name_mask` and its like. The
+    `image` itself is none, as it would be of a name without extension."""
     path = Path(name)
-    stems = [str(path.with_name(path.stem + tail)) for tail in _MASK_TAILS]
+    stems = [str(path.with_name(stem)) for stem in (*(path.stem + tail for tail in _MASK_TAILS), f"mask_{path.stem}")]
     candidates = [name + ".png", name + ".mask.png", str(path.with_name(f"{DYNAMIC_MASK}{path.stem}.png"))]
     candidates += [stem + suffix for stem in stems for suffix in (".png", path.suffix)]
     return next(

@@ -57,11 +57,13 @@ def match_images(
         raise CaptureError("\n".join([str(error), *several, *shrunk])) from None
     views = tuple(view for view, found in zip(source.views, there, strict=True) if found)
     source, paths = replace(source, views=views), [path for path in paths if path.is_file()]
-    spare = _without_camera(source, paths)
+    spare, masks = _without_camera(source, paths)
     if spare:
         shown = some_names(spare)
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
-    return _fitted(root, source, paths, options, warnings), len(spare)
+    photographs = _fitted(root, source, paths, options, warnings)
+    warnings += _note_unused(masks, photographs)
+    return photographs, len(spare)
 
 
 def _fuller_folders(root: Path, folder: Path, missing: Sequence[str]) -> list[str]:
@@ -82,18 +84,33 @@ def _image_paths(source: SourceCapture, folder: Path, available: ImageNameIndex,
     return [view.image_path or folder / (name or view.name) for view, name in zip(source.views, found_as, strict=True)]
 
 
-def _without_camera(source: SourceCapture, paths: list[Path]) -> list[str]:
-    """The images in the capture's folders that are neither at these paths nor masks of those that are."""
+def _without_camera(source: SourceCapture, paths: list[Path]) -> tuple[list[str], dict[str, Path]]:
+    """The images in the capture's folders that are not at these paths: those that have no camera, and the masks of
+    those that have one. Masked copies are neither."""
     named = set(paths)
     stems = {path.with_suffix("") for path in paths}
     others = {
         name: path
         for folder in source.image_folders
         for name, path in find_images(folder).items()
-        if path not in named and not _is_mask(path, stems)
+        if path not in named and not _is_masked_copy(path, stems)
     }
+    masks = {name: path for name, path in others.items() if _is_mask(path, stems)}
+    others = {name: path for name, path in others.items() if name not in masks}
     used = {path.resolve() for path in paths} if others else set()  # asked of the disk only where names differ
-    return [name for name, path in others.items() if path.resolve() not in used]
+    return [name for name, path in others.items() if path.resolve() not in used], masks
+
+
+def _note_unused(masks: dict[str, Path], photographs: Sequence[MatchedView]) -> list[str]:
+    """A note about the masks among photographs, by their names, that no photograph has."""
+    used = {photo.file.mask.resolve() for photo in photographs if photo.file.mask is not None} if masks else set()
+    unused = [name for name, path in masks.items() if path.resolve() not in used]
+    if not unused:
+        return []
+    return [
+        f"{len(unused)} images beside photographs are masks by their names and are not used ({some_names(unused)}). "
+        "One mask counts of each photograph, first that in a folder of masks; beside x.jpg it is called x_mask.png."
+    ]
 
 
 def _other_names_in_shrunk(source: SourceCapture, root: Path, available: ImageNameIndex) -> list[str]:
@@ -109,11 +126,13 @@ def _other_names_in_shrunk(source: SourceCapture, root: Path, available: ImageNa
     return [f"{source.images} has other names ({first}): give --images {whole} --downscale {factor} instead."]
 
 
+def _is_masked_copy(path: Path, stems: set[Path]) -> bool:
+    """Whether an image is a masked copy (BlendedMVS) of one of those beside it, which are given without suffixes."""
+    return path.stem.endswith(MASKED) and path.with_name(path.stem.removesuffix(MASKED)) in stems
+
+
 def _is_mask(path: Path, stems: set[Path]) -> bool:
-    """Whether an image is by its name the mask of one of those beside it, which are given without their suffixes, or a
-    masked copy (BlendedMVS)."""
-    if path.stem.endswith(MASKED) and path.with_name(path.stem.removesuffix(MASKED)) in stems:
-        return True
+    """Whether an image is by its name the mask of one of those beside it, which are given without their suffixes."""
     stem = masked_stem(path.stem) or (path.stem if Path(path.stem).suffix.lower() in readable_suffixes() else None)
     return stem is not None and bool({path.with_name(stem), path.with_name(Path(stem).stem)} & stems)
 
@@ -123,7 +142,7 @@ def _fitted(
 ) -> list[MatchedView]:
     """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
     photographs, problems = list[MatchedView](), list[str]()
-    masks = find_masks(root, source.images, source.views, options, warnings)
+    masks = find_masks(root, source.images, source.views, paths, options, warnings)
     for view, path in zip(source.views, paths, strict=True):
         mask = masks[view.name]
         try:

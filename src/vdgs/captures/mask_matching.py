@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from vdgs.captures.formats.source_capture import SourceView
 from vdgs.captures.image_files import find_images, find_mask, find_mask_beside, read_header, same_aspect
-from vdgs.captures.name_resolution import find_file, largest_shrunk
+from vdgs.captures.name_resolution import largest_shrunk
 from vdgs.captures.strays import MASK_FOLDERS
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -15,10 +15,14 @@ from vdgs.system.units import some_names
 
 
 def find_masks(
-    root: Path, images: str, views: Sequence[SourceView], options: CaptureOptions, warnings: list[str]
-) -> dict[str, Path | None]:
-    """The mask of every photograph by its name, None where it has none; says which masks and photographs have no
+    root: Path, images: str, views: Sequence[SourceView], paths: Sequence[Path], options: CaptureOptions,
+    warnings: list[str],
+) -> dict[str, Path | None]:  # fmt: skip
+    """The mask of every photograph by its view's name, None where it has none; says which masks and photographs have no
     partner.
+
+    `paths` are the photographs of the views, which may have other names than these: a model may know other folders,
+    cases and extensions. Masks are looked up by the photograph's own name first, then by that of its view.
 
     Raises `CaptureError` for a folder of masks that was asked for and is not there, and where masks are there but none
     of them is of a photograph.
@@ -30,16 +34,21 @@ def find_masks(
             " Of what moves they are made by --masks masks --block.mask-moving on." if options.masks == "auto" else ""
         )
         raise CaptureError(f"{folder}: no such folder, though --masks asks for it.{moving}")
-    masks = {view.name: _mask_of(view, root / images, folder) for view in views}
-    if folder.is_dir() and not any(view.mask_path for view in views):
-        _compare(folder, masks, asked_for, warnings)
+    named = {view.name: _names(view, path, root / images) for view, path in zip(views, paths, strict=True)}
+    masks = {
+        view.name: _mask_of(view, path, named[view.name], root / images, folder)
+        for view, path in zip(views, paths, strict=True)
+    }
+    named_masks = any(view.mask_path for view in views)
+    if folder.is_dir() and not named_masks:
+        _compare(folder, masks, mask_name(next(iter(named.values()))[0]), asked_for, warnings)
     without = [name for name, mask in masks.items() if mask is None]
     if 0 < len(without) < len(masks):
-        named = any(view.mask_path for view in views)
-        remedy = "name the missing masks with mask_path as well, or " if named else ""
+        remedy = "name the missing masks with mask_path as well, or " if named_masks else ""
+        example = folder / mask_name(named[without[0]][0])
         warnings.append(
             f"{len(masks) - len(without)} of {len(masks)} photographs have a mask; the others count whole. If that is "
-            f"not meant, {remedy}put the missing masks there, such as {folder / mask_name(without[0])}."
+            f"not meant, {remedy}put the missing masks there, such as {example}."
         )
     return masks
 
@@ -54,22 +63,34 @@ def _mask_folder(root: Path, options: CaptureOptions) -> Path:
     return elsewhere if not inside.is_dir() and elsewhere.is_dir() else inside
 
 
-def _mask_of(view: SourceView, images: Path, folder: Path) -> Path | None:
+def _names(view: SourceView, path: Path, images: Path) -> Sequence[str]:
+    """What a photograph is called: by its file in the folder of images, if it lies there, then by its view."""
+    own = [path.relative_to(images).as_posix()] if path.is_relative_to(images) else []
+    return list(dict.fromkeys([*own, view.name]))
+
+
+def _mask_of(view: SourceView, path: Path, names: Sequence[str], images: Path, folder: Path) -> Path | None:
     """The mask that the view names, else that in the folder of masks, else that beside its photograph."""
-    photograph = view.image_path or find_file(images, view.name)
-    mask = view.mask_path or find_mask(folder, view.name)
-    if mask is not None and photograph is not None and mask.is_file() and mask.samefile(photograph):
+    mask = view.mask_path or _first(find_mask(folder, name) for name in names)
+    if mask is not None and mask.is_file() and mask.samefile(path):
         raise CaptureError(
             f"{mask}: is the photograph itself, not a mask of it. Name the folder of the masks (--masks)."
         )
-    return mask or find_mask_beside(images, view.name, photograph)
+    places = [(path.parent, path.name), *((images, name) for name in names)]
+    return mask or _first(find_mask_beside(where, name, path) for where, name in dict.fromkeys(places))
 
 
-def _compare(folder: Path, masks: dict[str, Path | None], asked_for: bool, warnings: list[str]) -> None:
-    """Hold the files of a folder of masks against the masks that were found."""
+def _first(masks: Iterable[Path | None]) -> Path | None:
+    return next((mask for mask in masks if mask is not None), None)
+
+
+def _compare(
+    folder: Path, masks: dict[str, Path | None], example: str, asked_for: bool, warnings: list[str]
+) -> None:  # fmt: skip
+    """Hold the files of a folder of masks against the masks that were found; `example` is the name that one of them
+    would have."""
     used = {mask for mask in masks.values() if mask is not None}
     spare = [name for name, path in find_images(folder).items() if path not in used]
-    example = mask_name(next(iter(masks)))
     if not used and spare:
         raise CaptureError(
             f"{folder}: holds {len(spare)} masks, none of them of a photograph. Name them like the photographs "

@@ -6,6 +6,9 @@ camera level has horizontal right vectors and image-ups that agree, and these sa
 straight in front by parallel views cannot be told from a flight of one heading that looks straight down (the two are
 congruent): it is taken for the flight, with a warning. Nor can a steep slope, straight below cameras of one heading,
 be told from a ceiling. Positions may tell both (`position_fit.with_likelier_up`).
+
+Ground that slopes is flat too, but not level. Cameras that hang alike and fly in several directions turn about the
+vertical: where that axis is clearly another than that of least variance, it is up.
 """
 
 from __future__ import annotations
@@ -43,6 +46,11 @@ MIN_DOWN_COSINE = 0.5
 #: Below this ratio of singular values of the mean rotation cameras turned about one axis by enough to tell how they
 #: hang from how the world lies (choice).
 TURNED = 0.75
+#: The axis that cameras turn about is up, not that of least variance, from so many degrees between both on, where these
+#: are so many times as many as cameras hang otherwise than on average: more than views of flat ground are off (choice).
+MIN_SLOPE_DEG, MIN_SLOPE_RATIO = 4.0, 1.5
+#: Fewer photographs may agree by chance on an axis that is not up (choice).
+MIN_TURNING = 8
 #: Standard deviations of up in degrees: by views that look down, by cameras that are held level, where in doubt.
 VIEWS_DEG, LEVEL_DEG, UNCERTAIN_DEG = 3.0, 5.0, 20.0
 #: A told up axis farther than this from the estimated one is worth a warning.
@@ -111,8 +119,18 @@ def estimate_up(
     `centers` [n, 3], `rotations` [n, 3, 3] (rows: right, down and forward of a camera) and `points` [m, 3] in the
     source world. All of it turns with the world (no per-axis medians).
     """
-    up, how, _ = _estimate(_views(rotations), centers, points, warnings)
-    return up, how
+    views, doubts = _views(rotations), list[str]()
+    up, how, _ = _estimate(views, centers, points, doubts)
+    warnings += doubts
+    looks_down = float(np.linalg.norm(views.forward)) >= LOOKS_DOWN and _is_against_view(how)
+    vertical = _turn_axis(rotations) if looks_down and not doubts else None
+    if vertical is None:
+        return up, how
+    axis = -vertical.axis if vertical.axis @ views.forward > 0 else vertical.axis
+    slope = float(np.degrees(np.arccos(np.clip(up @ axis, -1, 1))))
+    if slope <= max(MIN_SLOPE_DEG, MIN_SLOPE_RATIO * vertical.scatter_deg):
+        return up, how
+    return axis, f"the axis that cameras turn about, over a slope of {slope:.0f} degrees"
 
 
 def _estimate(
@@ -143,6 +161,34 @@ def contradict_up(rotations: np.ndarray, told: np.ndarray, up: np.ndarray) -> bo
         return True
     is_far = float(told @ up) < np.cos(np.radians(MAX_UP_DEVIATION_DEG))
     return is_far and ours <= max(theirs, CLEAR_ROLL) and float(views.image_up @ up) > -MIN_VIEW_COSINE
+
+
+def _is_against_view(how: str) -> bool:
+    """Whether up was found as of a flight that looks down: not of cameras that are held level or upright."""
+    return not how.startswith("level") and UPPER_SIDES not in how
+
+
+class _TurnAxis(NamedTuple):
+    """The axis that cameras turn about."""
+
+    axis: np.ndarray
+    """Unit [3], of either sign, in the world of the cameras."""
+    scatter_deg: float
+    """The root mean square of the angles by which cameras hang about it otherwise than on average."""
+
+
+def _turn_axis(rotations: np.ndarray) -> _TurnAxis | None:
+    """The axis that cameras with these rotations [n, 3, 3] turn about; None where they turn too little, or are too few,
+    to tell.
+
+    It is the direction of the world that is most nearly the same in all cameras: the singular vector of their mean
+    rotation for the largest singular value, which is the mean cosine between it and where it is on average. A tilt
+    that all cameras share does not move it, however many fly which way.
+    """
+    _, values, axes = np.linalg.svd(rotations.mean(axis=0))
+    if len(rotations) < MIN_TURNING or values[1] >= TURNED:
+        return None
+    return _TurnAxis(axes[0], float(np.degrees(np.sqrt(2 * max(0.0, 1 - float(values[0]))))))
 
 
 def _other_up(views: _Views, axis: np.ndarray) -> OtherUp | None:
@@ -250,13 +296,13 @@ def _level(rights: np.ndarray, image_up: np.ndarray) -> np.ndarray:
 
 
 def up_by_views(centers: np.ndarray, rotations: np.ndarray, points: np.ndarray) -> UpByViews:
-    """Up as `estimate_up` has it, joined with the mean view where that looks down."""
+    """Up of a flight over flat ground or of level cameras, joined with the mean view where that looks down."""
     doubts: list[str] = []
     up, how, other = _estimate(_views(rotations), centers, points, doubts)
     mean = -rotations[:, 2].mean(axis=0)
     length = float(np.linalg.norm(mean))
     # Level at a wall, or nearly so: all views are one, but not down.
-    if length < LOOKS_DOWN or how.startswith("level") or UPPER_SIDES in how:
+    if length < LOOKS_DOWN or not _is_against_view(how):
         return UpByViews(up, UNCERTAIN_DEG if doubts else LEVEL_DEG, not doubts, other)
     mean = mean / length
     if up @ mean < np.cos(np.radians(AGREE_DEG)):  # a slope, or a lone oblique look: the views are nearer to the truth
