@@ -94,17 +94,24 @@ def test_positions_along_one_line_give_meters_and_say_how_level_is_known(tmp_pat
     assert any("what is level across it is by the views" in warning for warning in warnings)
     frame, warnings = placed(tmp_path, scene, positions_of(scene[0])[:2])
     assert not frame.metric
-    assert any("2 photographs with GPS are too few" in warning for warning in warnings)
+    assert any("2 photographs with GPS tell no scale" in warning for warning in warnings)
+
+
+def test_photographs_from_one_place_give_no_meters(tmp_path):
+    centers, points = flight(1, 20)
+    frame, warnings = placed(tmp_path, (np.tile(centers[:1], (20, 1)), points), positions_of(centers))
+    assert not frame.metric
+    assert any("20 photographs with GPS tell no scale" in warning for warning in warnings)
 
 
 def test_heights_over_a_slope_are_seen_where_all_photographs_look_one_way(tmp_path):
     """The plane tells the slope better there than the views, which lie between the ground and down."""
-    scene = flight(6, 6, slope_deg=15)
-    geodetic = positions_of(scene[0])
-    geodetic[:, 2] = 60 + 0.1 * np.arange(len(geodetic)) % 3
+    scene = flight(7, 7, slope_deg=20)
+    geodetic = positions_of(scene[0], noise=1.0)
+    geodetic[:, 2] = 360 + 0.3 * np.sin(np.arange(len(geodetic)))
     frame, warnings = placed(tmp_path, scene, geodetic)
     assert frame.rotation[2, 2] > np.cos(np.radians(4))
-    assert any("left out; up is by the views" in warning for warning in warnings)
+    assert any("its altitudes are all about 360" in warning for warning in warnings)
 
 
 def test_rows_that_are_not_used_are_told(tmp_path):

@@ -60,6 +60,8 @@ MAX_UP_DEVIATION_DEG = 30.0
 UPSIDE_DOWN_DEG = 120.0
 #: Fewer positions tell no scale and no north.
 MIN_POSITIONS = 3
+#: Nor do cameras that differ by no more than this share of their coordinates: rounding.
+ONE_PLACE = 1e-12
 #: Estimates of a fit's scale are no better than its arithmetic and rounded positions allow (share; choice).
 LEAST_SCALE_ERROR = 1e-4
 AXES = {
@@ -243,10 +245,11 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     positions = match_gps(scene.names, file)
     indices, geodetic = positions.images, positions.geodetic
     warnings += positions.notes
-    if len(indices) < MIN_POSITIONS:
+    centers = scene.centers[indices]
+    if len(indices) < MIN_POSITIONS or np.ptp(centers, axis=0).max() <= ONE_PLACE * np.abs(centers).max():
         warnings.append(
-            f"{file.name}: {len(indices)} photographs with GPS are too few, {MIN_POSITIONS} are needed; the frame is "
-            "estimated from the cameras instead and is not metric."
+            f"{file.name}: {len(indices)} photographs with GPS tell no scale (fewer than {MIN_POSITIONS}, or all taken "
+            "from one place); the frame is estimated from the cameras instead and is not metric."
         )
         return None
     origin = median_place(geodetic)
