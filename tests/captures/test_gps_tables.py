@@ -193,6 +193,25 @@ def test_columns_of_names_are_known_by_heading_or_by_what_they_hold(tmp_path, nu
     assert (row.name, row.position[:2]) == (name, PLACE[:2])
 
 
+def test_of_several_columns_of_names_that_of_pictures_counts(tmp_path):
+    file = tmp_path / "t.csv"
+    for label, name in (("1", "a.jpg"), ("a", "a.jpg"), ("a.jpg", "a.jpg"), ("a", "")):
+        file.write_text(f"Label,Filename,lat,lon,alt\n{label},{name},-33.5,-70.6,500\n")
+        assert read_gps_table(file).rows[0].name == (name or label)
+
+
+@pytest.mark.parametrize("said", ["undef", "inf", "-"])
+def test_what_programs_write_of_altitudes_that_they_do_not_know_is_none(tmp_path, said):
+    (file := tmp_path / "t.csv").write_text(f"name,lat,lon,alt\na.jpg,-33.5,-70.6,{said}\n")
+    assert np.isnan(read_gps_table(file).rows[0].position[2])
+
+
+def test_a_row_without_a_number_hides_nothing_of_the_others(tmp_path):
+    """Longitude first is told by what is more than 90."""
+    (file := tmp_path / "t.csv").write_text("a.jpg 149.1 -35.1 500\nb.jpg - - -\nc.jpg 149.101 -35.1 500\n")
+    assert [row.position for row in read_gps_table(file).rows] == [(-35.1, 149.1, 500), (-35.1, 149.101, 500)]
+
+
 @pytest.mark.parametrize(
     ("text", "encoding"),
     [
@@ -370,6 +389,8 @@ UTM = "EPSG:32632\nname;x;y;alt\na.jpg;{};{};{}\n"
         (DEGREES.format("39,12345", "-105,1", "412.523"), 412.523),
         (UTM.format("489334", "4330123", "412,523"), 412.523),  # 412 km is no altitude
         (UTM.format("489.334", "4.330.123", "1.634"), 1634),
+        (UTM.format("489 334,5", "4 330 123,7", "1,634"), 1.634),
+        (UTM.format("489'334,54", "4'330'123,74", "1,634"), 1.634),
         (UTM.format("489334", "4330123", "1634,5 m\nb.jpg;489334;4330123;1,634 m"), 1634.5),
         ("a.jpg 39.12345 -105.1 1,634\n", 1634),
         ('a.jpg,39.12345,-105.1,"1,634.5 m"\n', 1634.5),

@@ -194,18 +194,6 @@ def test_what_a_table_leaves_in_doubt_counts_in_the_place(tmp_path):
     assert "place ±300 m" in doubtful.accuracy
 
 
-def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
-    truth = tiny_scene(columns=6, rows=1)
-    for name, camera in truth.cameras.items():
-        pose = camera.camera_from_world.copy()
-        pose[:3, 3] = -pose[:3, :3] @ np.array([camera.position[0], 0.0, 10.0])
-        truth.cameras[name] = replace(camera, camera_from_world=pose, width=64, height=48)
-    frame, warnings = ground_of(truth, tmp_path, gps=write_gps(tmp_path / "gps.csv", truth))
-    assert not frame.metric
-    assert any("along one line" in warning for warning in warnings)
-    assert frame.rotation[2, 2] > 0.99
-
-
 def test_gps_without_altitudes_places_in_the_plane(tmp_path):
     truth = tiny_scene()
     rows = [line.rpartition(",")[0] for line in write_gps(tmp_path / "gps.csv", truth).read_text().splitlines()]

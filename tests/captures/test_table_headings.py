@@ -164,6 +164,7 @@ def test_a_row_of_units_below_the_headings_counts(tmp_path, units):
         ("Accuracy Horz [m]", "Accuracy Vert [m]"), ("hz accuracy", "vert. accuracy"), ("水平精度", "高程精度"),
         ("horizontal RMS", "vertical RMS (m)"), ("GPS accuracy horizontal", "altitude accuracy"),
         ("Genauigkeit Lage", "Genauigkeit Höhe"), ("std_xy", "std_up"), ("GPSHPositioningError", "sigma_z"),
+        ("std_xy", "RtkStdHgt"), ("std_xy", "ht std"),
     ],
 )  # fmt: skip
 def test_accuracies_are_known_by_the_words_of_their_headings(tmp_path, across, upwards):

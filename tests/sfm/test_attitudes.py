@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.flown_models import flown_model
-from vdgs.sfm.attitude_tilt import tilt_of_attitudes, tilt_of_views
+from vdgs.captures.turned_views import tilt_of_views
+from vdgs.sfm.attitude_tilt import tilt_of_attitudes
 from vdgs.sfm.image_metadata import attitude_from_gimbal
 from vdgs.sfm.up_direction import up_of
 

@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from vdgs.captures.gps_altitudes import wrong_reading, wrong_unit
 from vdgs.captures.position_adjustment import PositionFit, Problem, Up, settle
 from vdgs.captures.position_fit import fit_positions
+from vdgs.captures.position_lines import checked_on_a_line
 from vdgs.captures.up_axis import VIEWS_DEG, up_by_views
 from vdgs.sfm.flights import altitude_offsets
-from vdgs.sfm.georegistration import _checked_on_a_line, accuracy_of
+from vdgs.sfm.georegistration import accuracy_of
 from vdgs.sfm.gps_priors import GpsPriors
 from vdgs.sfm.image_metadata import attitude_from_gimbal, likeliest_attitude, read_attitudes
 from vdgs.sfm.recorded_headings import checked_by_headings
@@ -296,7 +297,7 @@ def test_heights_along_one_line_are_no_better_than_a_drift_that_nothing_tells(dr
     recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
     recorded[:, 2] += np.linspace(0, drift_m, 14)
     problem = Problem(centers=places, targets=recorded, times=np.linspace(0, 1, 14), up=views(0, 6.0))
-    fit, notes = _checked_on_a_line(fit_positions(problem), problem)
+    fit, notes = checked_on_a_line(fit_positions(problem), problem)
     assert abs(float((fit.placed - places)[:, 2].mean())) < fit.place_error_m[1] < 2 + drift_m
     assert bool(notes) == (drift_m > 0)
 
@@ -307,7 +308,7 @@ def test_a_long_line_is_not_doubted_for_what_up_may_be_off_by():
     recorded = places + rng.normal(0, 1, places.shape) * [0.5, 0.5, 0.8]
     tilted = Up(np.array([np.sin(np.radians(1)), 0, np.cos(np.radians(1))]), 1.0, "the views")
     problem = Problem(centers=places, targets=recorded, times=np.linspace(0, 1, 60), up=tilted)
-    fit, notes = _checked_on_a_line(fit_positions(problem), problem)
+    fit, notes = checked_on_a_line(fit_positions(problem), problem)
     assert not notes
     assert fit.place_error_m[1] < 15
 

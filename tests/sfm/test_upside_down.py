@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vdgs.captures.position_adjustment import Up
+from vdgs.captures.turned_views import are_turned_over
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.sfm import georegistration
-from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.georeferencing import _refuse_no_scene, _refuse_upside_down
 from vdgs.sfm.georegistration import Georegistration
 from vdgs.sfm.gps_priors import GpsPriors, read_gps_priors

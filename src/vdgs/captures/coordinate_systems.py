@@ -366,6 +366,13 @@ def is_in_degrees(header: str) -> bool:
     return bool(pyproj.CRS.from_user_input(pyproj_name(header)).is_geographic)
 
 
+def is_geocentric(header: str) -> bool:
+    """Whether a system that `to_geodetic` knows counts from the middle of the Earth: then no z is no place."""
+    import pyproj
+
+    return bool(pyproj.CRS.from_user_input(pyproj_name(header)).is_geocentric)
+
+
 def geocentric_to_geodetic(header: str, file: Path) -> ToGeodetic:
     """What brings Earth-centred metres of the datum of a system to latitude, longitude and height of WGS 84: by the
     shift that the system gives itself (TOWGS84), or as PROJ knows its datum."""

@@ -13,6 +13,8 @@ _EITHER = re.compile(r"[+-]?[1-9]\d{0,2}([.,])\d{3}")
 _DECIMAL = re.compile(r"[+-]?\d*([.,])\d+")
 #: Signs between thousands: of several, or in front of a decimal sign.
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:(?:(,)\d{3})+(?:\.\d+|,\d{3})|(?:(\.)\d{3})+(?:,\d+|\.\d{3}))")
+#: Blanks and apostrophes between thousands (French, Swiss): the sign behind them is before decimals.
+_SPACED = re.compile(r"[+-]?\d{1,3}(?:[ \u00a0\u202f\u2009'’]\d{3})+([.,])\d+")
 #: A number, and a unit behind it as in `1,636 m Above Sea Level`.
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]+)((?:\s*(?:m|ft|feet|foot|met(?:er|re)s?)\b[\w ]*)?)", re.IGNORECASE)
 
@@ -28,7 +30,9 @@ class _Shown:
         """Note what a word shows that is no larger than `most`."""
         match = _WITH_UNIT.fullmatch(word)
         number = match[1] if match else ""
-        if grouped := _GROUPED.fullmatch(number):
+        if spaced := _SPACED.fullmatch(word.strip()):
+            self.decimal |= {spaced[1]}
+        elif grouped := _GROUPED.fullmatch(number):
             sign = grouped[1] or grouped[2]
             self.thousands.add(sign)
             self.decimal.add("." if sign == "," else ",")

@@ -118,7 +118,8 @@ def match_gps(names: Sequence[str], file: Path) -> GpsPositions:
     """
     table = read_gps_table(file)
     found = match_rows(names, table.rows, file, table.numbered)
-    positions, notes = np.array([row.position for row in found.values()]).reshape(-1, 3), [*table.notes]
+    notes = [*table.notes, *unmatched_notes(table.rows, found, file)]
+    positions = np.array([row.position for row in found.values()]).reshape(-1, 3)
 
     def name_unused(which: np.ndarray, why: str) -> None:
         if which.any():
@@ -134,6 +135,9 @@ def match_gps(names: Sequence[str], file: Path) -> GpsPositions:
         known &= ~far
     positions = without_zero_altitudes(positions, known)
     kept, has_altitudes = with_altitudes(positions[:, 2], known)
+    name_unused(known & ~kept, "has no altitude")
+    if not has_altitudes and (others := int((known & np.isfinite(positions[:, 2])).sum())):
+        notes.append(f"{file.name}: most positions have no altitude; those of {others} are not used.")
     positions = np.where([True, True, has_altitudes], positions, 0.0)
     images = np.array(list(found), int)[kept]
     stated = [(math.nan,) * 3 if row.gps_std is None else (row.gps_std[0], *row.gps_std) for row in found.values()]
@@ -167,6 +171,15 @@ def match_rows(names: Sequence[str], rows: Sequence[GpsRow], file: Path, numbere
             "line of its own, such as EPSG:32633."
         )
     return dict(sorted(found.items()))
+
+
+def unmatched_notes(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], file: Path) -> list[str]:
+    """What to say of rows that are of no photograph."""
+    used = {row.name for row in found.values()}  # rows that say the same of a photograph twice are no others
+    spare = list(dict.fromkeys(row.name for row in rows if row.name not in used))
+    if not spare:
+        return []
+    return [f"{file.name}: {len(spare)} rows are of photographs that are not there; left out ({first_names(spare)})."]
 
 
 def _best_rows(

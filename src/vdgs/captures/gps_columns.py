@@ -87,12 +87,12 @@ def read_columns(rows: list[Row], system: str | None, file: Path) -> tuple[Colum
     """The columns and the rows below their names. Raises CaptureError."""
     head, *body = rows
     below = [row.words for row in body]
-    known = with_sides(with_names(known_columns(head.words), below), below)
+    known = with_sides(with_names(head.words, known_columns(head.words), below), below)
     if {"lat", "lon"} <= set(known):
         _refuse_parted_angles(head.words, file)
         if "name" not in known:
             raise _lacks_names(head.words, file)
-        return _with_angles(_described(head.words, known), head.words, system, file), body
+        return _with_angles(_described(head.words, known), rows, system, file), body
     if {"name", "x", "y"} <= set(known):
         return _with_plane(_described(head.words, known), rows, system, file), body
     if not _has_numbers(head):
@@ -137,11 +137,18 @@ def _described(words: Sequence[str], known: dict[str, int]) -> Columns:
     return Columns(known, None, unit, heights=heights, deviation_units=units)
 
 
-def _with_angles(columns: Columns, words: Sequence[str], system: str | None, file: Path) -> Columns:
-    """The columns of latitudes and longitudes, of `system` where that is of another datum than WGS 84."""
+def _with_angles(columns: Columns, rows: Sequence[Row], system: str | None, file: Path) -> Columns:
+    """The columns of latitudes and longitudes, without x and y beside them (of a local or a projected system); of
+    `system`, or else that of the rows, where it is of another datum than WGS 84. Raises CaptureError."""
+    (_, words), *body = rows
     angles = {what: read_heading(words[columns.where[what]]) for what in ("lat", "lon")}
+    codes = _codes_of_rows(body, columns.where.get("system")) if system is None else [system]
+    datums = [code for code in codes if _is_datum(code, file)]
+    if datums and len(codes) > 1:
+        raise _several_systems(codes, file)
     return columns._replace(
-        system=system if system is not None and _is_datum(system, file) else None,
+        where={what: k for what, k in columns.where.items() if what not in ("x", "y")},
+        system=next(iter(datums), None),
         across_units=(angles["lat"].degrees, angles["lon"].degrees),
         angles=angles,
         o_side=west_or_east(words),
@@ -154,7 +161,10 @@ def _with_plane(columns: Columns, rows: Sequence[Row], system: str | None, file:
     (_, words), *body = rows
     known = columns.where
     if system is None and "system" in known:
-        system = _system_of_rows(body, known["system"], file)
+        codes = _codes_of_rows(body, known["system"])
+        if len(codes) > 1:
+            raise _several_systems(codes, file)
+        system = next(iter(codes), None)
     if system is None and _are_degrees(body, known):
         note = "does not say what x and y are; they look like longitude and latitude, and are taken as that."
         return columns._replace(where={**known, "lon": known["x"], "lat": known["y"]}, note=note)
@@ -170,15 +180,20 @@ def _with_plane(columns: Columns, rows: Sequence[Row], system: str | None, file:
     return columns._replace(system=system, across_units=(told_meters(x), told_meters(y)))
 
 
-def _system_of_rows(rows: Sequence[Row], k: int, file: Path) -> str | None:
-    """The coordinate system that a column names, the same in all rows; None where it is empty."""
-    codes = sorted({row.words[k].strip() for row in rows if k < len(row.words)} - {""})
-    if len(codes) > 1:
-        raise CaptureError(
-            f"{file}: names several coordinate systems ({', '.join(codes[:3])}). Make a table of each, or give "
-            "name,lat,lon,alt."
-        )
-    return f"EPSG:{codes[0]}" if codes and codes[0].isdecimal() else next(iter(codes), None)
+def _codes_of_rows(rows: Sequence[Row], k: int | None) -> list[str]:
+    """The coordinate systems that a column names; none where there is no such column, or it is empty."""
+    if k is None:
+        return []
+    words = {row.words[k].strip() for row in rows if k < len(row.words)} - {""}
+    codes = ((word, re.fullmatch(r"(\d+)(?:\.0+)?", word)) for word in words)  # of pandas: 25832.0
+    return sorted({f"EPSG:{code[1]}" if code else word for word, code in codes})
+
+
+def _several_systems(codes: Sequence[str], file: Path) -> CaptureError:
+    return CaptureError(
+        f"{file}: names several coordinate systems ({', '.join(codes[:3])}). Make a table of each, or give "
+        "name,lat,lon,alt."
+    )
 
 
 def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
@@ -192,7 +207,7 @@ def _by_order(rows: Sequence[Row], system: str | None, file: Path) -> Columns:
     places = _places_in(rows, 1, 2)
     if _have_quaternions(rows) and not _are_on_land(places):
         raise HoldsPoses(f"{file}: holds poses: positions and quaternions without names of columns. {LOCAL_METERS}.")
-    largest = np.abs(places).max(axis=0, initial=0)
+    largest = np.nanmax(np.abs(places), axis=0, initial=0)
     if max(largest) > 180:
         raise NoSystem(
             f"{file}: names neither its columns nor the coordinate system of values such as {words[1]}, "
@@ -224,7 +239,8 @@ def _local_remedy(places: np.ndarray) -> str:
 def _are_on_land(places: np.ndarray) -> bool:
     """Whether numbers [n, 2] may be degrees of one flight, and not about 0, 0."""
     level = np.column_stack([places, np.full(len(places), np.nan)])
-    middle = np.median(places, axis=0) if len(places) else np.zeros(2)
+    known = places[np.isfinite(places).all(axis=1)]
+    middle = np.median(known, axis=0) if len(known) else np.zeros(2)
     return not why_no_flight(level) and bool((np.abs(middle) >= NO_LAND_DEG).any())
 
 

@@ -22,6 +22,7 @@ from vdgs.captures.coordinate_systems import (
     ToGeodetic,
     datum_error,
     height_unit,
+    is_geocentric,
     outside_area,
     to_geodetic,
 )
@@ -232,7 +233,8 @@ def _positions(
         columns = columns._replace(across_units=units, unit_note=note)
         return _projected(rows, columns, change, name, file), columns, name
     positions = _geodetic(rows, columns, file)
-    changed = change(np.array(positions)[:, [1, 0, 2]] / [1, 1, columns.system_altitude_unit])
+    given = np.array(positions)[:, [1, 0, 2]] / [1, 1, columns.system_altitude_unit]
+    changed = _changed(given, change, rows, columns, f"no place in {name}. Is it the right system?", file)
     return [(float(a), float(b), c) for (a, b, _), (*_, c) in zip(changed, positions, strict=True)], columns, name
 
 
@@ -381,16 +383,27 @@ def _projected(
     given = np.array(places)
     across = [in_units_of(columns.system or "", unit, file) for unit in columns.across_units]
     given *= [*across, 1 / columns.system_altitude_unit]
+    doubt = f"no place in {system}. Is it the right system, and x (east) before y (north)?"
+    return [(float(a), float(b), float(c)) for a, b, c in _changed(given, change, rows, columns, doubt, file)]
+
+
+def _changed(
+    given: np.ndarray, change: ToGeodetic, rows: Sequence[Row], columns: Columns, doubt: str, file: Path
+) -> np.ndarray:
+    """Latitude, longitude and height [n, 3] of places in the units of a system; heights that are not known (NaN) stay
+    so. Raises CaptureError, for no place on Earth with what it is in words."""
     known = np.isfinite(given[:, 2])
+    if not known.all() and is_geocentric(columns.system or ""):
+        raise CaptureError(
+            f"{file}: line {rows[int(np.argmin(known))].number}: has no z, and {columns.system} counts from the middle "
+            "of the Earth: x and y alone are no place. Mend the row, or leave it out."
+        )
     changed = change(np.where(np.isfinite(given), given, 0.0))
     changed[~known, 2] = math.nan
-    for row, place, position in zip(rows, places, changed, strict=True):
+    for row, place, position in zip(rows, given.tolist(), changed, strict=True):
         if not np.isfinite(position[:2]).all() or abs(position[0]) > 90:
-            raise CaptureError(
-                f"{file}: line {row.number}: {place[0]:.10g}, {place[1]:.10g} is no place in {system}. Is it the right "
-                "system, and x (east) before y (north)?"
-            )
-    return [(float(a), float(b), float(c)) for a, b, c in changed]
+            raise CaptureError(f"{file}: line {row.number}: {place[0]:.10g}, {place[1]:.10g} is {doubt}")
+    return changed
 
 
 def _deviations(row: Row, columns: Columns) -> tuple[float, float] | None:

@@ -33,17 +33,19 @@ from vdgs.captures.known_distances import MOST_APART, known_scale_of_views
 from vdgs.captures.odd_positions import MIN_SPREAD_M, do_not_spread
 from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import USUAL_M, PositionFit, Problem, Up
-from vdgs.captures.position_fit import fit_positions, with_likelier_up
+from vdgs.captures.position_fit import OTHER_COSINE, fit_positions, with_likelier_up
+from vdgs.captures.position_lines import checked_on_a_line, is_nearly_collinear
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import by_axis, told_up
 from vdgs.captures.tables_beside import position_tables, table_note
+from vdgs.captures.turned_views import are_turned_over
 from vdgs.captures.up_axis import HINT, MAX_UP_DEVIATION_DEG, OR_CEILING, contradict_up, estimate_up, up_by_views
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_centers
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.ground_frame import GroundFrame
-from vdgs.geometry.similarity import geometric_median, is_collinear, rotation_to_z
+from vdgs.geometry.similarity import geometric_median, rotation_to_z
 from vdgs.system.units import two_digits
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
@@ -52,6 +54,15 @@ NOMINAL_CAMERA_HEIGHT = 10.0
 FAR_FROM_ORIGIN_M = 1000.0
 #: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
 MAX_ENU_DISTANCE_M = 50_000.0
+#: A told up axis so far from the estimated one is worth a warning even where the estimate is in doubt: what is taken for
+#: ground may be a wall, 90 degrees away.
+UPSIDE_DOWN_DEG = 120.0
+#: Fewer positions tell no scale and no north.
+MIN_POSITIONS = 3
+#: Nor do cameras that differ by no more than this share of their coordinates: rounding.
+ONE_PLACE = 1e-12
+#: Estimates of a fit's scale are no better than its arithmetic and rounded positions allow (share; choice).
+LEAST_SCALE_ERROR = 1e-4
 AXES = {
     sign + name: factor * np.eye(3)[index]
     for index, name in enumerate("xyz")
@@ -233,10 +244,11 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     positions = match_gps(scene.names, file)
     indices, geodetic = positions.images, positions.geodetic
     warnings += positions.notes
-    if is_collinear(scene.centers[indices]):
+    centers = scene.centers[indices]
+    if len(indices) < MIN_POSITIONS or np.ptp(centers, axis=0).max() <= ONE_PLACE * np.abs(centers).max():
         warnings.append(
-            f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
-            "fix no up axis; the frame is estimated from the cameras instead and is not metric."
+            f"{file.name}: {len(indices)} photographs with GPS tell no scale (fewer than {MIN_POSITIONS}, or all taken "
+            "from one place); the frame is estimated from the cameras instead and is not metric."
         )
         return None
     origin = median_place(geodetic)
@@ -247,22 +259,25 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             "scale nor north; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    problem = _problem(scene, positions, enu)
-    _refuse_mirrored(problem, file)
-    problem, doubt = with_likelier_up(problem)
+    by_views = _problem(scene, positions, enu)
+    if by_views.up.sure or (by_views.up.other is not None and by_views.up.other.doubt == OR_CEILING):
+        _refuse_mirrored(by_views, file)
+    problem, doubt = with_likelier_up(by_views)
     if doubt:
         warnings.append(f"{file.name}: {doubt}. If that is wrong, leave --gps out, and {HINT}")
     fit = _fit_table(problem, geodetic[:, 2], file, warnings)
+    _refuse_upside_down(scene, by_views, fit, file)
     refused = fit.why_refused(file.name)
     if refused:
         warnings.append(f"{file.name}: {refused}; it is ignored and the frame is estimated.")
         return None
+    fit, is_line = _checked_on_a_line(fit, problem, file, warnings)
     if weighed := weighing_note(fit.deviations, fit.inliers):
         warnings.append(f"{file.name}: {weighed}")
     if not fit.inliers.all():
         names = ", ".join(scene.names[i] for i in indices[~fit.inliers][:5])
         warnings.append(f"{file.name}: {(~fit.inliers).sum()} GPS positions left out as outliers ({names}).")
-    frame = _frame_of_fit(fit, origin, positions.datum_error_m, file)
+    frame = _frame_of_fit(fit, origin, positions.datum_error_m, file, " along one line" if is_line else "")
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), frame.description)
     if why := why_no_scene(frame.to_ground(scene.centers), 0.0):
         raise CaptureError(f"{file}: placed by it, {why}. Mend the table, or leave --gps out. {LOCAL_METERS}.")
@@ -289,20 +304,52 @@ def _problem(scene: _Scene, positions: GpsPositions, enu: np.ndarray) -> Problem
 
 def _refuse_mirrored(problem: Problem, file: Path) -> None:
     """Raise CaptureError for positions that fit the cameras only as their mirror image."""
-    up = problem.up
     image = problem.targets * [-1.0, 1.0, 1.0]  # of which exchanged axes are a turn
-    is_told = up.sure or (up.other is not None and up.other.doubt == OR_CEILING)
-    if is_told and mirrored(problem.centers, problem.targets, up.direction, {"the mirror image": image}):
+    if mirrored(problem.centers, problem.targets, problem.up.direction, {"the mirror image": image}):
         raise CaptureError(
             f"{file}: its positions fit the cameras only as their mirror image. Are lat and lon exchanged, or is the "
             "minus sign of south or west missing? Mend the table, or leave --gps out."
         )
 
 
+def _refuse_upside_down(scene: _Scene, problem: Problem, fit: PositionFit, file: Path) -> None:
+    """Raise CaptureError for a fit that turns the world over, against what the views say of up: as tables do that are
+    mirrored, for a level flight is its own mirror image from below. Views that look one way do not say for sure what is
+    up, but then no fit lays them on their side and mirrors them."""
+    up, cosine = problem.up, float(fit.similarity.rotation[2] @ problem.up.direction)
+    turned_over = are_turned_over(scene.rotations @ fit.similarity.rotation.T)
+    if turned_over or (up.other is not None and cosine < OTHER_COSINE):
+        _refuse_mirrored(problem, file)
+    height = float(np.median(fit.similarity.apply(scene.centers)[:, 2]))
+    height -= float(np.median(fit.similarity.apply(scene.points)[:, 2]))
+    if cosine < 0 and (up.sure or (height < 0 and turned_over)):
+        raise CaptureError(
+            f"{file}: placed by it, the cameras would be {abs(height):.3g} m {'under' if height < 0 else 'over'} the "
+            "points and look up, against what they show. Are lat and lon (x and y, east and north) exchanged, or is "
+            "the minus sign of south or west missing? Mend the table, or leave --gps out."
+        )
+
+
+def _checked_on_a_line(fit: PositionFit, problem: Problem, file: Path, warnings: list[str]) -> tuple[PositionFit, bool]:
+    """The fit with what positions along one line leave open, which it says, and whether they are: across the line the
+    views alone tell what is level."""
+    trusted = fit.inliers
+    if not is_nearly_collinear(problem.targets[trusted], fit.deviations[trusted]):
+        return fit, False
+    fit, notes = checked_on_a_line(fit, problem)
+    warnings += [f"{file.name}: {note}" for note in notes]
+    warnings.append(
+        f"{file.name}: its positions lie along one line: what is level across it is by {problem.up.how}, good to "
+        f"{two_digits(min(180.0, fit.level_error_deg))}° (95 %)."
+    )
+    return fit, True
+
+
 def _frame_of_fit(
-    fit: PositionFit, origin: tuple[float, float, float], datum_error_m: float, file: Path
+    fit: PositionFit, origin: tuple[float, float, float], datum_error_m: float, file: Path, layout: str
 ) -> GroundFrame:
-    """The frame that a fit to positions in ENU of the origin makes, and how good it is in words."""
+    """The frame that a fit to positions in ENU of the origin makes, and how good it is in words; `layout` is how the
+    positions lie, in words, where that matters."""
     inliers, has_altitudes = fit.inliers, fit.altitude != "none"
     axes = slice(3 if has_altitudes else 2)
     rms = float(np.sqrt((fit.residuals[inliers, axes] ** 2).sum(axis=1).mean()))
@@ -313,8 +360,8 @@ def _frame_of_fit(
         ("across", "up"),
         lambda good: f"±{two_digits(good)}",
     )
-    method = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
-    accuracy = f"place {place}, scale ±{fit.scale_error:.2%} (95 %)"
+    method = f"GPS of {inliers.sum()} photographs{layout}, RMS {rms:.2f} m"
+    accuracy = f"place {place}, scale ±{max(fit.scale_error, LEAST_SCALE_ERROR):.2%} (95 %)"
     return GroundFrame(
         scale=fit.similarity.scale,
         rotation=fit.similarity.rotation,
@@ -340,7 +387,7 @@ def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
     doubts: list[str] = []
     up, _ = estimate_up(scene.centers, scene.rotations, scene.points, doubts)
     angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
-    if angle > MAX_UP_DEVIATION_DEG and not doubts:
+    if angle > (UPSIDE_DOWN_DEG if doubts else MAX_UP_DEVIATION_DEG):
         warnings.append(
             f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.description}). "
             "If the scene looks tilted, give --up."

@@ -64,7 +64,8 @@ def fit_positions(problem: Problem) -> PositionFit:
     starts = _upright_starts(problem)
     if problem.has_altitudes and problem.up.sure and len(problem.centers) >= ENOUGH_TO_DOUBT:
         plane = _settle_in_plane(replace(problem, has_altitudes=False))
-        if are_over_ground(problem.targets[:, 2], plane.placed, problem.up.deviation_deg):
+        tilt_deg = min(problem.up.deviation_deg, plane.level_error_deg / BOTH_WITHIN)  # views of one way tell it worse
+        if are_over_ground(problem.targets[:, 2], plane.placed, tilt_deg):
             return plane
     if problem.has_altitudes and not is_collinear(problem.centers):
         starts.append(fit_similarity_robust(problem.centers, problem.targets, 100)[0])

@@ -30,11 +30,11 @@ _COLUMNS: dict[str, frozenset[str]] = {
         "lon": "lon long lng longitude gpslongitude gpslon gpslong gpslng xlongitude longitudex longitudedeg londeg "
         "wgs84lon wgs84longitude longitudewgs84 xlon cameralongitude originallongitude lange langengrad "
         "laenge laengengrad longitud longitudine 经度",
-        "alt": "z h up zh heightz pointz ellh hell hmsl hae msl amsl asl",
-        "x": "x pointx "
+        "alt": "z h up zh heightz pointz geoz ellh hell hmsl hae msl amsl asl",
+        "x": "x pointx geox "
         "easting east e utmeasting utmx xeasting xe eastingx coordx xm eastingm xeast rechtswert ostwert este",
-        "y": "y pointy northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth hochwert "
-        "nordwert norte",
+        "y": "y pointy geoy northing north n utmnorthing utmy ynorthing yn northingy coordy ym northingm ynorth "
+        "hochwert nordwert norte",
         "latref": "latref latituderef gpslatituderef",
         "lonref": "lonref longituderef gpslongituderef",
         "altref": "altref altituderef gpsaltituderef",
@@ -61,7 +61,7 @@ _ACCURACY = (
 _SIDES_OF_ACCURACY = {
     "across": ("horizontal|horiz|horz|hor|hz|2d|planimetric|lage|orizzontale|水平|平面", "xy|h|en|ne"),
     "upwards": (
-        "vertical|vert|ver|altitude|alt|height|elevation|elev|ele|hohe|hoehe|vertikal|verticale|垂直|高程",
+        "vertical|vert|ver|altitude|alt|height|hgt|hght|ht|elevation|elev|ele|hohe|hoehe|vertikal|verticale|垂直|高程",
         "z|v|u|up",
     ),
     "eastwards": ("east|easting|longitude|lon|lng", "x|e"),
@@ -114,7 +114,7 @@ _LARGEST = re.compile(_ANGLE + r"max", re.IGNORECASE)
 _NO_ALTITUDES = frozenset({"ground", "undulation"})
 
 #: What programs write where they know nothing.
-UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na"})
+UNKNOWN = frozenset({"", "nan", "none", "null", "-", "n/a", "na", "undef", "inf", "-inf"})
 
 #: And what programs for rasters write then.
 NO_DATA = frozenset({-9999.0, -99999.0, -32767.0, -32768.0})
@@ -263,19 +263,32 @@ def _are_altitudes(words: Sequence[str]) -> bool:
     return bool(values) and all(-450 < value < 9000 for value in values)  # False for NaN
 
 
-def with_names(known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[str, int]:
-    """The known columns of these rows of places, with that of photographs' names where no heading says which it is: one
-    of identifiers that are no plain numbers, else the first that holds names of pictures."""
-    if "name" in known or not {*known} & {"lat", "lon", "x", "y"}:
+def with_names(words: Sequence[str], known: Mapping[str, int], rows: Sequence[Sequence[str]]) -> dict[str, int]:
+    """The known columns of these rows of places below the headings `words`, with that of photographs' names: of several
+    that headings say hold names the first of pictures, else the first; where no heading says which it is one of
+    identifiers that are no plain numbers, else the first that holds names of pictures."""
+    if "name" in known:
+        named = (k for k, word in enumerate(words) if "name" in known_columns([word]) and _holds_pictures(rows, k))
+        return {**known, "name": next(named, known["name"])}
+    if not {*known} & {"lat", "lon", "x", "y"}:
         return dict(known)
     places = {*known.values()} - {known.get("id")}
     columns = [k for k in range(max(map(len, rows), default=0)) if k not in places]
     for k in sorted(columns, key=lambda k: k != known.get("id")):
-        words = [row[k].strip() for row in rows if k < len(row) and row[k].strip()]
-        labels = k == known.get("id") and not all(math.isfinite(number_of(word)) for word in words)
-        if words and (labels or all(PurePosixPath(word).suffix.lower() in _PICTURES for word in words)):
+        labels = k == known.get("id") and not all(math.isfinite(number_of(word)) for word in _words_in(rows, k))
+        if labels or _holds_pictures(rows, k):
             return {**known, "name": k}
     return dict(known)
+
+
+def _words_in(rows: Sequence[Sequence[str]], k: int) -> list[str]:
+    return [row[k].strip() for row in rows if k < len(row) and row[k].strip()]
+
+
+def _holds_pictures(rows: Sequence[Sequence[str]], k: int) -> bool:
+    """Whether all words of a column are names of pictures."""
+    words = _words_in(rows, k)
+    return bool(words) and all(PurePosixPath(word).suffix.lower() in _PICTURES for word in words)
 
 
 def parted_angles(words: Sequence[str]) -> list[str]:

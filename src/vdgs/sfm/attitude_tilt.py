@@ -1,4 +1,4 @@
-"""The tilt of a world by recorded attitudes, some of them wrong, told from how cameras hang; and views that look up."""
+"""The tilt of a world by recorded attitudes, some of them wrong, told from how cameras hang."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ MIN_HEADING_SPREAD = 0.3
 #: Attitudes farther from where the others have up than so many medians (some 3.5 standard deviations), and so many
 #: degrees, are wrong: there and back, a camera that hangs by 2.5 degrees leaves 5 between the directions (choice).
 MEDIANS_AWAY, WRONG_DEG = 3.0, 5.0
-#: Views that look up by more than this from straight down (degrees, median) are of nothing that flies over ground, and
-#: nor are those by more than the second whose upper sides point down by so much (cosine, median; choice).
-UPWARDS_DEG, UPWARDS_TURNED_DEG, TURNED_OVER = 150.0, 105.0, -0.25
 #: Rounds of the least sum of distances that tells them, and the distance (radians) from which on it counts.
 ROUNDS, LEAST_AWAY = 20, 1e-4
 
@@ -48,15 +45,3 @@ def _least_squares(unknown: np.ndarray, off: np.ndarray, weights: np.ndarray) ->
     roots = np.sqrt(weights)[:, None]
     flat = (roots[:, :, None] * unknown).reshape(-1, unknown.shape[2])
     return np.asarray(np.linalg.lstsq(flat, (roots * off).ravel(), rcond=None)[0])
-
-
-def tilt_of_views(rotations: np.ndarray) -> float:
-    """Angle in degrees (median) between the views of cameras [n, 3, 3] and straight down, in a world with z up."""
-    return float(np.median(np.degrees(np.arccos(np.clip(-rotations[:, 2, 2], -1, 1)))))
-
-
-def are_turned_over(rotations: np.ndarray) -> bool:
-    """Whether cameras [n, 3, 3] in a world with z up look up as only those of a world do that is upside down, or those
-    under a ceiling: nearly straight, or with their upper sides down."""
-    tilt, upper_sides = tilt_of_views(rotations), float(np.median(-rotations[:, 1, 2]))
-    return tilt > UPWARDS_DEG or (tilt > UPWARDS_TURNED_DEG and upper_sides < TURNED_OVER)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from vdgs.captures.odd_positions import places_apart
+from vdgs.captures.position_lines import is_nearly_collinear
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.geometry.geodesy import SEMI_MAJOR_M
 from vdgs.sfm.capture_writer import is_impossible, placed_images
@@ -20,7 +21,6 @@ from vdgs.sfm.focal_length import AGREE, CALIBRATED_SOURCE, alike
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import FISHEYE, ImageMetadata
 from vdgs.sfm.incremental_mapper import height_over_points
-from vdgs.sfm.position_lines import is_nearly_collinear
 from vdgs.sfm.preflight import OBLIQUE_ANGLE_DEG
 from vdgs.sfm.reprojection import mean_reprojection_error
 from vdgs.sfm.workspace import call_cancellable

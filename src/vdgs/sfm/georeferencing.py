@@ -13,12 +13,12 @@ from vdgs.captures.plane_fit import mirrored
 from vdgs.captures.position_adjustment import Up
 from vdgs.captures.reconstruction import AccuracyFacts, GcpReport
 from vdgs.captures.table_columns import FOOT_M
+from vdgs.captures.turned_views import are_turned_over
 from vdgs.config.sfm_options import SfmOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.similarity import Similarity, rotation_to_z
 from vdgs.sfm import gcp_adjustment, georegistration
 from vdgs.sfm.attitude_readings import confirmed_by_model
-from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.bending import bend_to_positions, tell_level
 from vdgs.sfm.focal_decision import OF_LENSES
 from vdgs.sfm.gcp_list import GcpList

@@ -9,19 +9,19 @@ import numpy as np
 
 from vdgs.captures.gps_altitudes import refuse_unit, wrong_reading, wrong_unit
 from vdgs.captures.plane_fit import mirrored
-from vdgs.captures.position_adjustment import DRIFT_COSTS, DRIFT_M, STATED_TIMES, PositionFit, Problem, Up
+from vdgs.captures.position_adjustment import DRIFT_COSTS, STATED_TIMES, PositionFit, Problem, Up
 from vdgs.captures.position_fit import OTHER_COSINE, fit_positions, with_likelier_up
+from vdgs.captures.position_lines import are_along_a_line, checked_on_a_line
 from vdgs.captures.position_weights import are_told, relative_deviations, weighing_note, with_unstated
 from vdgs.captures.reconstruction import AccuracyFacts
+from vdgs.captures.turned_views import are_turned_over
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu, median_place
 from vdgs.geometry.similarity import Similarity
-from vdgs.sfm.attitude_tilt import are_turned_over
 from vdgs.sfm.barometer_fit import fit_by_barometer
 from vdgs.sfm.flights import FIXED_M, AltitudeOffsets, altitude_offsets, time_order, untrusted_offsets
 from vdgs.sfm.gps_priors import MIN_POSITIONS, GpsPriors
 from vdgs.sfm.image_metadata import ImageMetadata
-from vdgs.sfm.position_lines import are_along_a_line
 from vdgs.sfm.recorded_headings import checked_by_headings
 from vdgs.sfm.take_off_heights import recorded_heights
 from vdgs.sfm.up_direction import camera_rotation, up_of
@@ -31,10 +31,6 @@ from vdgs.system.units import two_digits
 #: So many positions far from where the photographs put them are worth a note, each by more than the cameras see; that
 #: distance is found of about so many photographs.
 MIN_ELSEWHERE, VIEWS_LOOKED_AT = 3, 20
-#: Altitudes along a line that change so many times their error against what is known of up are worth a note (choice).
-MUCH_DRIFT = 4.0
-#: Altitudes of receivers hardly ever drift by more than this in a flight, in metres.
-MOST_DRIFT_M = 2 * DRIFT_M
 ADVICE_WRITE_GPS = (
     "let the drone write GPS into the photographs, or give a table of positions (--gps), surveyed points (--gcp) or a "
     "known distance (--scale-bar) now: the finished capture is placed anew in seconds."
@@ -121,7 +117,7 @@ def georegister(
         refuse_unit(_unit(fit, problem, positions), "the cameras", positions.table)
     fit, of_reading = _checked_reading(fit, problem, positions)
     on_a_line = are_along_a_line(*(each[fit.inliers] for each in (targets, positions.gps_std[rows], fit.deviations)))
-    fit, of_line = _checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
+    fit, of_line = checked_on_a_line(fit, problem) if on_a_line and not barometer else (fit, [])
     fit, of_north = checked_by_headings(fit, images, taken, problem.times)
     refused = fit.why_refused(positions.source)
     if refused and not anyway:
@@ -336,26 +332,6 @@ def _checked_reading(fit: PositionFit, problem: Problem, positions: GpsPriors) -
         + ("A table of positions (--gps) mends it." if positions.source == "EXIF" else "Mend the table.")
     )
     return replace(fit, place_error_m=(across, up + off)), [note]
-
-
-def _checked_on_a_line(fit: PositionFit, problem: Problem) -> tuple[PositionFit, list[str]]:
-    """The fit of positions along one line, where nothing tells a drift of altitudes from a climb but what is known of
-    up without positions: heights are no better than the two differ. A note where that is much."""
-    if fit.altitude != "used" or problem.stated is not None:
-        return fit, []
-    apart = fit.placed[:, 2] - fit.placed @ fit.similarity.rotation @ problem.up.direction
-    drift, (across, up) = float(np.ptp(apart[fit.inliers])), fit.place_error_m
-    length = float(np.ptp(fit.placed[fit.inliers, :2], axis=0).max())
-    is_explained = drift <= 2 * np.tan(np.radians(problem.up.deviation_deg)) * length  # by up alone
-    found = replace(fit, place_error_m=(across, up + (min(drift, MOST_DRIFT_M) if is_explained else drift) / 2))
-    if not problem.up.sure or drift < MUCH_DRIFT * up or (is_explained and drift > MOST_DRIFT_M):
-        return found, []
-    note = (
-        f"along the one line of the flight the recorded altitudes change by {two_digits(drift)} m against what "
-        f"{problem.up.how} say: a drift, or up is off. Heights above the sea are only good to "
-        f"±{two_digits(found.place_error_m[1])} m."
-    )
-    return found, [note]
 
 
 def _over_ground(fit: PositionFit) -> str:

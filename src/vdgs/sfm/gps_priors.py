@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.flight_extent import why_no_flight
-from vdgs.captures.georeference import match_rows
+from vdgs.captures.georeference import match_rows, unmatched_notes
 from vdgs.captures.gps_altitudes import refuse_unit, with_altitudes, without_zero_altitudes, wrong_unit
 from vdgs.captures.gps_tables import GpsRow, read_gps_table
 from vdgs.captures.odd_positions import MIN_SPREAD_M, are_far_off, are_nowhere, do_not_spread, places_apart
@@ -245,7 +245,7 @@ def _read_geodetic(photographs: Sequence[ImageMetadata], table: Path | None) -> 
         geodetic[index], kinds[index] = row.position, f"as in {table.name}"
         if not np.isfinite(row.position[2]):
             geodetic[index, 2], kinds[index] = _or_nan(photographs[index].altitude), photographs[index].altitude_type
-    notes = [*read.notes, *_unmatched(read.rows, rows, table), *_far_off(geodetic, photographs, table)]
+    notes = [*read.notes, *unmatched_notes(read.rows, rows, table), *_far_off(geodetic, photographs, table)]
     notes += _beside(rows, photographs, table, read.datum_error_m)
     notes += _other_altitudes(rows, photographs, table)
     without = [index for index, row in rows.items() if not np.isfinite(row.position[2])]
@@ -354,15 +354,6 @@ def _other_altitudes(rows: Mapping[int, GpsRow], photographs: Sequence[ImageMeta
 
 def _or_nan(value: float | None) -> float:
     return np.nan if value is None else value
-
-
-def _unmatched(rows: Sequence[GpsRow], found: Mapping[int, GpsRow], table: Path) -> list[str]:
-    """What to say of rows that are of no photograph."""
-    used = {row.name for row in found.values()}  # rows that say the same of a photograph twice are no others
-    spare = list(dict.fromkeys(row.name for row in rows if row.name not in used))
-    if not spare:
-        return []
-    return [f"{table.name}: {len(spare)} rows are of photographs that are not there; left out ({first_names(spare)})."]
 
 
 def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:

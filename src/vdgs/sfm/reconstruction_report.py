@@ -19,8 +19,8 @@ from vdgs.captures.reconstruction import (
     ImageReport,
     ReconstructionReport,
 )
+from vdgs.captures.turned_views import tilt_of_views
 from vdgs.errors import CaptureError
-from vdgs.sfm.attitude_tilt import tilt_of_views
 from vdgs.sfm.camera_rigs import describe_rigs
 from vdgs.sfm.capture_writer import lens_of, placed_images
 from vdgs.sfm.feature_extraction import CameraGroup

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vdgs.sfm.position_lines import are_along_a_line
+from vdgs.captures.position_lines import are_along_a_line
 
 TURN = np.linspace(0, 2 * np.pi, 31)
 ORBIT = np.stack([28 * np.cos(TURN), 33 * np.sin(TURN), 0 * TURN], axis=1)
