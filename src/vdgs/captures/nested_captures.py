@@ -238,6 +238,14 @@ def _say_of_project(root: Path, folder: Path) -> str:
 
 
 def _say_of_capture(root: Path, folder: Path) -> str:
+    if is_mega_nerf(folder) and _count_images(folder, False) == 0:
+        beside = _photographs_beside(root, folder)
+        return (
+            f"{folder} is a capture of Mega-NeRF without its photographs (train/rgbs, val/rgbs), which lie there "
+            "undistorted and by other names. Its copy_images.py puts them there: python scripts/copy_images.py "
+            f"--image_path {shell_word(beside) if beside else 'PHOTOGRAPHS'} --dataset_path {shell_word(folder)}; "
+            f"then: vdgs run {shell_word(folder)} --output RUN"
+        )
     return f"{folder} is a capture: vdgs run {shell_word(folder)}{_images_beside(root, folder)} --output RUN"
 
 

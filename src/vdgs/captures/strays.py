@@ -26,7 +26,14 @@ _PRODUCTS = re.compile(
     r"odm_\w+|opensfm|entwine_pointcloud|3d_tiles|dsm|dtm|dem|chm|ndvi|ortho(photos?|mosaics?)|dsm_ortho|mosaics?"
     r"|1_initial|2_densification|3_dsm_ortho|4_index|.+\.files|.+\.rcproj|stereo|depth_?maps?|normal_maps?|depths?"
     r"|normals?|contact_?sheets?|renders?|reports?|textures?|texturing|\d+_orthophoto|undistorted_depths"
-    r"|semantics?|labels?(_\w+)?|\w+-label-img|annotations?|gt|ground_?truth|seg(mentations?)?",
+    r"|meshroomcache|semantics?|labels?(_\w+)?|\w+-label-img|annotations?|gt|ground_?truth|seg(mentations?)?",
+    re.IGNORECASE,
+)
+#: Folders of pictures that say something of photographs, which may as well be called after a place: only where the
+#: photographs lie elsewhere.
+_LAYERS = re.compile(
+    r"conf(idences?)?([_-]?maps?)?|mono[_-]?depths?|depth_(da|dav2|anything\w*)|rgb_depth|disparit(y|ies)|disp"
+    r"|instances?|segments?|sam_masks|(optical_)?flows?|edges|canny|sky_?masks?|masks?_sky|(mono|stable)_?normals?",
     re.IGNORECASE,
 )
 #: Files by which programs mark a folder of their results (ours: maps, renders, runs).
@@ -107,6 +114,12 @@ def is_undistorted_here(picture: Path) -> bool:
     """Whether a picture is one that vdgs undistorted, by the record beside it, or the mask of such a one."""
     record = picture.with_name(f"{picture.name.removesuffix('.mask.png')}.json")
     return record.is_file() and "made_from" in read_json_or_empty(record)
+
+
+def is_layer_folder(name: str) -> bool:
+    """Whether a folder is called as those of pictures of depth, classes, motion and the like, which may be a place's
+    name too."""
+    return bool(_LAYERS.fullmatch(name))
 
 
 def is_undistorted_folder(name: str) -> bool:
