@@ -156,12 +156,12 @@ def find_files(folders: Sequence[Path]) -> Found:
                     _count_other(found, path, stems)
     layers = picture_layers(found.named) | unnamed_pictures(found.named)
     found.left_out |= layers
-    folders = layer_folders({name: path for name, path in found.named.items() if name not in layers})
-    found.skipped |= dict.fromkeys(folders, "results of a program, of the photographs of these names elsewhere")
+    about = layer_folders({name: path for name, path in found.named.items() if name not in layers})
+    found.skipped |= dict.fromkeys(about, "results of a program, of the photographs of these names elsewhere")
     found.named = {
         name: path
         for name, path in sorted(found.named.items())
-        if name not in layers and not any(str(folder) in folders for folder in PurePosixPath(name).parents)
+        if name not in layers and not any(str(folder) in about for folder in PurePosixPath(name).parents)
     }
     return found
 
