@@ -10,9 +10,10 @@ import pytest
 
 from support.advice import advised_words
 from support.captures import TinyScene, write_colmap, write_images
-from support.dataset_layouts import halves, write_matrixcity, write_transforms
+from support.dataset_layouts import halves, write_matrixcity, write_mega_nerf, write_transforms
 from support.metashape_files import metashape_xml
 from support.true_flight import true_flight
+from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.loading import load_capture
 from vdgs.captures.nested_captures import model_below
 from vdgs.config.capture_options import CaptureOptions
@@ -111,3 +112,18 @@ def test_parts_of_a_divided_project_are_all_named(tmp_path, scene):
     assert follow(str(refused.value))[1].images is None  # its own photographs lie beside it
     others = "submodels/submodel_0001, submodels/submodel_0002"
     assert f"(beside it: {others}; a run is of one)" in str(refused.value)
+
+
+def test_a_mega_nerf_set_without_photographs_names_the_script_that_makes_them(tmp_path, scene):
+    write_mega_nerf(tmp_path / "set", scene)
+    for side in ("train", "val"):
+        shutil.rmtree(tmp_path / "set" / side / "rgbs")
+    write_images(tmp_path / "photos", scene)
+    with pytest.raises(CaptureError) as refused:
+        read_source(tmp_path, CaptureOptions())
+    words = advised_words(
+        "copy_images.py --image_path WORD --dataset_path WORD; then: vdgs run WORD", str(refused.value)
+    )
+    assert words == [str(tmp_path / "photos"), *2 * [str(tmp_path / "set")]]
+    with pytest.raises(CaptureError, match=r"copy_images\.py --image_path PHOTOGRAPHS"):
+        read_source(tmp_path / "set", CaptureOptions())

@@ -7,7 +7,7 @@ training and test photographs or masks, that is read (choice). A note says which
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,15 +26,15 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.mvsnet import is_mvsnet, read_mvsnet
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import image_root
-from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_points
+from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, SourceView, no_points
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, is_transforms, read_transforms
-from vdgs.captures.image_files import find_images, readable_suffixes
-from vdgs.captures.name_resolution import largest_shrunk, match_stem
+from vdgs.captures.image_files import find_images
+from vdgs.captures.image_places import image_folder
 from vdgs.captures.nested_captures import foreign_poses, model_below
 from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
-from vdgs.captures.strays import check_no_run, is_mask_folder, why_not_read
+from vdgs.captures.strays import check_no_run
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.quoting import shell_word
@@ -159,7 +159,8 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
     if distinct:
         sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
         warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
-    images, image_warnings = image_folder(root, options)
+    model = read_colmap(folder, options.strict)
+    images, image_warnings = image_folder(root, options, _is_bent(model.views))
     for larger in larger_models_beside(root, folder):
         warnings.append(
             f"{larger.relative_to(root)} holds {count_images(larger)} images, and {folder.relative_to(root)}, which is "
@@ -168,7 +169,6 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
         )
     if has_both_kinds(folder):
         warnings.append(f"{folder.relative_to(root) / 'images.bin'} is read; images.txt beside it is not.")
-    model = read_colmap(folder, options.strict)
     warnings += model.notes
     if not model.views:
         raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
@@ -192,67 +192,13 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
 
 def use_image_folder(source: SourceCapture, root: Path, name: str) -> SourceCapture:
     """A COLMAP capture that was read without `--images`, with the photographs of another folder."""
-    _, notes = image_folder(root, CaptureOptions())
+    _, notes = image_folder(root, CaptureOptions(), _is_bent(source.views))
     kept = tuple(note for note in source.warnings if note not in notes)
     return replace(source, images=name, image_folders=(root / name,), warnings=kept)
 
 
-def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
-    """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
-    if options.images is not None:
-        return options.images, []
-    if (root / "images").is_dir():
-        return "images", []
-    name = largest_shrunk(root, "images")
-    if name is None:
-        return _other_image_folder(root)
-    return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
-
-
-def _other_image_folder(root: Path) -> tuple[str, list[str]]:
-    """`Images`, or the only other place of images beside the model, and a note. Raises CaptureError that names the
-    places where there are several, and what to give instead of a model alone."""
-    named = [entry.name for entry in sorted(root.iterdir()) if entry.is_dir() and find_images(entry)]
-    alike = [name for name in named if name.lower() == "images"]
-    if len(alike) == 1:
-        return alike[0], [f"no images/ folder; {alike[0]} is used instead (--images chooses)."]
-    named += ["."] if any(entry.suffix.lower() in readable_suffixes() for entry in root.iterdir()) else []
-    likely = [name for name in named if not is_mask_folder(name) and not why_not_read(root / name)]
-    if len(likely) == 1 and likely[0].lower() not in ("input", "distorted", "undistorted"):  # of other lenses
-        return likely[0], [f"no images/ folder; the photographs in {root / likely[0]} are used (--images chooses)."]
-    if not named:
-        _refuse_model_alone(root)
-    raise _no_one_folder(root, named, likely)
-
-
-def _no_one_folder(root: Path, named: list[str], likely: list[str]) -> CaptureError:
-    together = f"; --images . for those of {' and '.join(likely)} together" if _are_apart(root, named, likely) else ""
-    options = " or ".join(f"--images {name}" for name in named or ["FOLDER, wherever it is"])
-    return CaptureError(
-        f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there, or name the folder that "
-        f"they are in: {options}{together}."
-    )
-
-
-def _refuse_model_alone(root: Path) -> None:
-    """Raise CaptureError where the photographs of a model lie in one of the two folders above it."""
-    above = next((folder for folder in root.resolve().parents[:2] if (folder / "images").is_dir()), None)
-    if above is None:
-        return
-    models = {model.resolve() for model in find_models(above)}
-    if any(model.resolve() in models for model in find_models(root)):
-        give = f"Give the folder of both: {shell_word(above)}"
-    else:
-        give = f"Say where: vdgs run {shell_word(root)} --images {shell_word(above / 'images')}"
-    raise CaptureError(f"{root}: is a model alone; its photographs lie beside it. {give}")
-
-
-def _are_apart(root: Path, named: list[str], likely: list[str]) -> bool:
-    """Whether photographs lie in several folders alone, and each has a name of its own."""
-    if len(likely) < 2 or "." in named:
-        return False
-    stems = [match_stem(name) for folder in likely for name in find_images(root / folder)]
-    return len(set(stems)) == len(stems)
+def _is_bent(views: Sequence[SourceView]) -> bool:
+    return any(view.intrinsics.is_distorted for view in views)
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.

@@ -54,7 +54,7 @@ NOMINAL_CAMERA_HEIGHT = 10.0
 FAR_FROM_ORIGIN_M = 1000.0
 #: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
 MAX_ENU_DISTANCE_M = 50_000.0
-#: A told up axis so far from the estimated one is worth a warning even where the estimate is in doubt: what is taken for
+#: A told up axis so far from the estimated one is worth a note even where the estimate is in doubt: what is taken for
 #: ground may be a wall, 90 degrees away.
 UPSIDE_DOWN_DEG = 120.0
 #: Fewer positions tell no scale and no north.

@@ -18,10 +18,17 @@ from vdgs.captures.formats.source_capture import (
     format_list,
     refuse_many_missing,
 )
-from vdgs.captures.image_files import find_images, is_turned, read_header, readable_suffixes, same_aspect
+from vdgs.captures.image_files import (
+    ROUNDING_PX,
+    find_images,
+    is_turned,
+    read_header,
+    readable_suffixes,
+    same_aspect,
+)
 from vdgs.captures.mask_matching import check_mask, find_masks
 from vdgs.captures.name_resolution import ImageNameIndex, find_in_other_folders, several_places
-from vdgs.captures.strays import MASKED, masked_stem
+from vdgs.captures.strays import MASKED, is_undistorted_here, masked_stem
 from vdgs.captures.undistortion import ImageFile
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
@@ -29,6 +36,11 @@ from vdgs.system.units import some_names
 
 #: Photographs whose size differs from that of most by more than this share are mentioned; rounding differs by less.
 MAX_SIZE_DEVIATION = 0.2
+#: Programs that undistort photographs change the sizes of both sides by less than this share, to any number of pixels.
+MAX_UNDISTORTED_DEVIATION = 0.1
+#: People shrink photographs to widths that are multiples of these numbers of pixels, or by such shares (choice: one
+#: undistorted width in ten is, too).
+ROUND_PX, ROUND_SHARE = (16, 50), 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +57,7 @@ def match_images(
     """Every view with its image file, and how many images have no camera: these become a warning, and so do some
     cameras without an image. Raises CaptureError where many are missing."""
     folder = root / source.images
-    available = ImageNameIndex(find_images(folder)) if folder.is_dir() else ImageNameIndex({})
+    available = ImageNameIndex(_images_in(folder)) if folder.is_dir() else ImageNameIndex({})
     paths = _image_paths(source, folder, available, warnings)
     there = [path.is_file() for path in paths]
     missing = [view.name for view, found in zip(source.views, there, strict=True) if not found]
@@ -64,6 +76,13 @@ def match_images(
     photographs = _fitted(root, source, paths, options, warnings)
     warnings += _note_unused(masks, photographs)
     return photographs, len(spare)
+
+
+def _images_in(folder: Path) -> dict[str, Path]:
+    """The images below a folder, as `find_images`, without those in folders of undistorted copies of ours."""
+    return {
+        name: path for name, path in find_images(folder).items() if "/" not in name or not is_undistorted_here(path)
+    }
 
 
 def _fuller_folders(root: Path, folder: Path, missing: Sequence[str]) -> list[str]:
@@ -92,7 +111,7 @@ def _without_camera(source: SourceCapture, paths: list[Path]) -> tuple[list[str]
     others = {
         name: path
         for folder in source.image_folders
-        for name, path in find_images(folder).items()
+        for name, path in _images_in(folder).items()
         if path not in named and not _is_masked_copy(path, stems)
     }
     masks = {name: path for name, path in others.items() if _is_mask(path, stems)}
@@ -156,8 +175,46 @@ def _fitted(
         raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{format_list(problems)}")
     if problems:
         raise CaptureError(problems[0])
-    warnings += _shrunk_otherwise(photographs)
+    warnings += [*_shrunk_otherwise(photographs), *_all_but_whole(photographs)]
     return photographs
+
+
+def _all_but_whole(photographs: list[MatchedView]) -> list[str]:
+    """A warning where photographs of bent lenses are all but as large as their cameras, as undistorted copies are."""
+    found = [
+        (photo.view.name, *sizes)
+        for photo in photographs
+        if photo.view.intrinsics.is_distorted
+        and _is_all_but_whole(*(sizes := (_size(photo.file.intrinsics), _size(photo.view.intrinsics))))
+    ]
+    if not found:
+        return []
+    name, (width, height), (wide, high) = found[0]
+    return [
+        f"{len(found)} of {len(photographs)} photographs are all but as large as their cameras ({name}: {width}x"
+        f"{height}, the camera {wide}x{high}), and are undistorted by the lenses of these. If they are undistorted "
+        "copies already, edges will be blurred: give the photographs that the model is of."
+    ]
+
+
+def _size(intrinsics: Intrinsics) -> tuple[int, int]:
+    return intrinsics.width, intrinsics.height
+
+
+def _is_all_but_whole(size: tuple[int, int], camera: tuple[int, int]) -> bool:
+    """Whether a photograph's width and height differ from those of its camera by more than rounding, and by little."""
+    apart = max(abs(one - other) for one, other in zip(size, camera, strict=True))
+    return apart > ROUNDING_PX and apart <= MAX_UNDISTORTED_DEVIATION * max(camera)
+
+
+def _is_undistorted_size(size: tuple[int, int], camera: tuple[int, int]) -> bool:
+    """Whether a photograph is all but as large as its camera, and nobody shrinks photographs to such a size."""
+    if not _is_all_but_whole(size, camera):
+        return False
+    longer, whole = max(size), max(camera)
+    by_share = abs(longer - round(longer / whole / ROUND_SHARE) * ROUND_SHARE * whole) < ROUNDING_PX
+    is_enlarged = longer > whole or min(size) > min(camera)
+    return is_enlarged or not (by_share or any(longer % step == 0 for step in ROUND_PX))
 
 
 def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:
@@ -195,6 +252,13 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
         raise CaptureError(
             f"{path}: {sizes}: another shape, so the two do not belong together. {hint}Use the images that the model "
             "was made from, or shrink them evenly."
+        )
+    if intrinsics.is_distorted and _is_undistorted_size((header.width, header.height), _size(intrinsics)):
+        raise CaptureError(
+            f"{path}: is {header.width}x{header.height}, but its camera, whose lens is bent, is {intrinsics.width}x"
+            f"{intrinsics.height}: as programs leave photographs that they undistort, which would be undistorted once "
+            "more. Give the photographs that the model is of, or these with their own model (of COLMAP the folder that "
+            "image_undistorter wrote, with images and sparse in it)."
         )
     return scale_intrinsics(intrinsics, header.width, header.height)
 

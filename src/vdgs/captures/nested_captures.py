@@ -217,7 +217,7 @@ def _captures_below(root: Path) -> list[tuple[Path, str]]:
     """Folders below `root` that are captures, those that lie higher first, without what is in them: whether each is a
     `project`, a `capture` with photographs, or a `model` alone."""
     found = list[tuple[Path, str]]()
-    for folder in _folders(root):
+    for folder in folders_below(root):
         if any(known in folder.parents for known, _ in found) or not is_capture(folder):
             continue
         is_whole = "capture" if _has_photographs(folder) else "model"
@@ -238,6 +238,14 @@ def _say_of_project(root: Path, folder: Path) -> str:
 
 
 def _say_of_capture(root: Path, folder: Path) -> str:
+    if is_mega_nerf(folder) and _count_images(folder, False) == 0:
+        beside = _photographs_beside(root, folder)
+        return (
+            f"{folder} is a capture of Mega-NeRF without its photographs (train/rgbs, val/rgbs), which lie there "
+            "undistorted and by other names. Its copy_images.py puts them there: python scripts/copy_images.py "
+            f"--image_path {shell_word(beside) if beside else 'PHOTOGRAPHS'} --dataset_path {shell_word(folder)}; "
+            f"then: vdgs run {shell_word(folder)} --output RUN"
+        )
     return f"{folder} is a capture: vdgs run {shell_word(folder)}{_images_beside(root, folder)} --output RUN"
 
 
@@ -287,7 +295,7 @@ def foreign_poses(root: Path) -> list[str]:
     """Poses below `root` that other programs made and that are not read, and what makes a capture of them: of each kind
     one file, for some programs write one for each photograph."""
     found: dict[str, Path] = {}
-    for folder in (root, *_folders(root)):
+    for folder in (root, *folders_below(root)):
         known = [(next(iter(sorted(folder.glob(name))), None), what) for name, what in _OTHERS.items()]
         known += [(file, _by_content(file)) for file in sorted(folder.iterdir())]
         for file, what in known:
@@ -347,7 +355,7 @@ def _by_content(file: Path) -> str:
     return found or next((what for is_this, what in checks if is_this(path, whole)), "")
 
 
-def _folders(root: Path) -> Iterator[Path]:
+def folders_below(root: Path) -> Iterator[Path]:
     """Folders below `root`, those that lie higher first, without hidden ones."""
     level = [root]
     for _ in range(DEEPEST):
@@ -368,7 +376,7 @@ def _has_photographs(folder: Path) -> bool:
 
 def _photographs_inside(folder: Path) -> Path | None:
     """The folder with most images in that of a model, itself included."""
-    below = [each for each in _folders(folder) if not any(map(is_mask_folder, each.relative_to(folder).parts))]
+    below = [each for each in folders_below(folder) if not any(map(is_mask_folder, each.relative_to(folder).parts))]
     places = [folder, *(each for each in below if why_not_read(each) is None)]
     counts = {place: _count_images(place, True) for place in places}
     best = max(places, key=lambda place: counts[place])

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 
 from vdgs.errors import CaptureError
+from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.permissions import refusal
 from vdgs.system.quoting import shell_word
 
@@ -25,13 +26,23 @@ _PRODUCTS = re.compile(
     r"odm_\w+|opensfm|entwine_pointcloud|3d_tiles|dsm|dtm|dem|chm|ndvi|ortho(photos?|mosaics?)|dsm_ortho|mosaics?"
     r"|1_initial|2_densification|3_dsm_ortho|4_index|.+\.files|.+\.rcproj|stereo|depth_?maps?|normal_maps?|depths?"
     r"|normals?|contact_?sheets?|renders?|reports?|textures?|texturing|\d+_orthophoto|undistorted_depths"
-    r"|semantics?|labels?(_\w+)?|\w+-label-img|annotations?|gt|ground_?truth|seg(mentations?)?",
+    r"|meshroomcache|semantics?|labels?(_\w+)?|\w+-label-img|annotations?|gt|ground_?truth|seg(mentations?)?",
+    re.IGNORECASE,
+)
+#: Folders of pictures that say something of photographs, which may as well be called after a place: only where the
+#: photographs lie elsewhere.
+_LAYERS = re.compile(
+    r"conf(idences?)?([_-]?maps?)?|mono[_-]?depths?|depth_(da|dav2|anything\w*)|rgb_depth|disparit(y|ies)|disp"
+    r"|instances?|segments?|sam_masks|(optical_)?flows?|edges|canny|sky_?masks?|masks?_sky|(mono|stable)_?normals?",
     re.IGNORECASE,
 )
 #: Files by which programs mark a folder of their results (ours: maps, renders, runs).
 _MARKS = ("map.json", "render.json", "capture.json", "partition.json", "export.json", "steps.json")
-#: What a folder of maps holds that is no photograph, where `map.json` lies beside it.
-_OF_MAPS = {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png"}
+#: What folders of maps and of `vdgs inspect` hold that is no photograph, where the file lies beside it that marks them.
+_OF_RESULTS = {
+    "map.json": {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png"},
+    "report.json": {"visibility_map.png", "visibility.png"},
+}
 #: Pictures of ours, and what screens leave on a disk.
 _PICTURES = re.compile(
     r"(photographs|reconstruction|contact[_ -]?sheet)\.(png|jpe?g)|screen[ _-]?shots?(?![a-z]).*|bildschirmfoto.*"
@@ -40,6 +51,12 @@ _PICTURES = re.compile(
     r"|(屏幕|螢幕)?(截图|截圖|截屏|快照).*|스크린샷.*"
     r"|(odm_)?(orthophoto|orthomosaic|ortho|dsm|dtm|dem|hillshade|mosaic)([_-].*)?\.(tiff?|png|jpe?g)"
     r"|.+[_-](orthophoto|orthomosaic|transparent_mosaic[_-]?\w*|mosaic_\w+|dsm|dtm|ortho)\.(tiff?|png|jpe?g)",
+    re.IGNORECASE,
+)
+#: Folders of undistorted copies, as COLMAP, OpenMVS, Meshroom, Polycam and people call them.
+_UNDISTORTED_FOLDER = re.compile(
+    r"(images?|photos?|pictures?)?[ _-]?(undist(ort(ed|ion)?)?|rectif(ied|y)|corrected)"
+    r"[ _-]?(images?|photos?|pictures?)?|dense|mvs|preparedensescene|imagecorrection",
     re.IGNORECASE,
 )
 #: What folders of masks are called, the usual name first.
@@ -88,9 +105,26 @@ def check_no_run(folder: Path) -> None:
 
 def is_result(file: Path) -> bool:
     """Whether a picture is by its name a map, an overview or a picture of a screen, not a photograph."""
-    of_map = file.name.lower() in _OF_MAPS and (file.parent / "map.json").is_file()
+    marks = [mark for mark, names in _OF_RESULTS.items() if file.name.lower() in names]
     name = unicodedata.normalize("NFC", file.name)  # systems write letters and their accents apart
-    return of_map or bool(_PICTURES.fullmatch(name))
+    return any((file.parent / mark).is_file() for mark in marks) or bool(_PICTURES.fullmatch(name))
+
+
+def is_undistorted_here(picture: Path) -> bool:
+    """Whether a picture is one that vdgs undistorted, by the record beside it, or the mask of such a one."""
+    record = picture.with_name(f"{picture.name.removesuffix('.mask.png')}.json")
+    return record.is_file() and "made_from" in read_json_or_empty(record)
+
+
+def is_layer_folder(name: str) -> bool:
+    """Whether a folder is called as those of pictures of depth, classes, motion and the like, which may be a place's
+    name too."""
+    return bool(_LAYERS.fullmatch(name))
+
+
+def is_undistorted_folder(name: str) -> bool:
+    """Whether a folder is called as those are into which programs write undistorted copies of photographs."""
+    return bool(_UNDISTORTED_FOLDER.fullmatch(name))
 
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[Path], dict[Path, str]]]:

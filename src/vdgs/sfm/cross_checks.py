@@ -19,6 +19,7 @@ from vdgs.sfm.image_metadata import BODY, GIMBAL, ImageMetadata, looks_backwards
 from vdgs.sfm.other_cameras import other_cameras
 from vdgs.sfm.photograph_versions import versions
 from vdgs.sfm.stitched_pictures import stitched
+from vdgs.sfm.undistorted_copies import undistorted_copies
 
 #: Focal lengths within this share of each other are one.
 ONE_FOCAL = 0.02
@@ -201,6 +202,7 @@ def strays(photographs: Sequence[ImageMetadata]) -> tuple[dict[str, str], dict[s
     """
     reasons = other_cameras(photographs) | stitched(photographs)
     reasons |= versions([photo for photo in photographs if photo.name not in reasons])
+    reasons |= undistorted_copies([photo for photo in photographs if photo.name not in reasons])
     reasons |= cut_pictures([photo for photo in photographs if photo.name not in reasons])
     tagged = [photo for photo in photographs if not photo.is_bare]
     bare = [photo for photo in photographs if photo.is_bare and photo.name not in reasons]

@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from vdgs.captures.image_files import readable_images, readable_suffixes
 from vdgs.captures.image_suffixes import (
@@ -25,7 +25,7 @@ from vdgs.captures.optional_decoders import INSTALL
 from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER
 from vdgs.captures.strays import MASKED, is_result, previewed_stem, walk
 from vdgs.errors import CaptureError
-from vdgs.sfm.picture_layers import picture_layers
+from vdgs.sfm.picture_layers import layer_folders, picture_layers, unnamed_pictures
 from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.quoting import check_is_text
 from vdgs.system.units import first_names, some_names
@@ -154,9 +154,15 @@ def find_files(folders: Sequence[Path]) -> Found:
                         _add(found, path, prefix + path.relative_to(folder).as_posix(), stems)
                 elif not (is_film(path) and str(path.resolve()) in used):
                     _count_other(found, path, stems)
-    layers = picture_layers(found.named)
+    layers = picture_layers(found.named) | unnamed_pictures(found.named)
     found.left_out |= layers
-    found.named = {name: path for name, path in sorted(found.named.items()) if name not in layers}
+    about = layer_folders({name: path for name, path in found.named.items() if name not in layers})
+    found.skipped |= dict.fromkeys(about, "results of a program, of the photographs of these names elsewhere")
+    found.named = {
+        name: path
+        for name, path in sorted(found.named.items())
+        if name not in layers and not any(str(folder) in about for folder in PurePosixPath(name).parents)
+    }
     return found
 
 

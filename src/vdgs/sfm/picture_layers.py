@@ -1,4 +1,5 @@
-"""Pictures of depth, classes and normals beside the photographs that they are of: `0001_depth.png`, `depth_0001.png`.
+"""Pictures of depth, classes and normals beside the photographs that they are of: `0001_depth.png`, `depth_0001.png`;
+and folders of such, and pictures that programs write of a whole set.
 
 A picture is one only where its name says so, a photograph of the same name but for that word lies in its folder, its
 pixels are those of such a picture and no camera is named in its tags: photographs of a depth gauge stay.
@@ -8,13 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
 
 from vdgs.captures.image_files import has_camera, mode_of, open_image
 from vdgs.captures.image_suffixes import IMAGE_SUFFIXES
+from vdgs.captures.strays import is_layer_folder
 
 #: Words of names, in small letters, and what the picture shows.
 _LAYER = re.compile(
@@ -25,6 +27,8 @@ _LAYER = re.compile(
 )
 #: Words of the names of photographs, as opposed to those.
 _PHOTOGRAPH = re.compile(r"(?<![a-z])(rgba?|colou?r|image|img|frame|photo|view)(?![a-z])")
+#: What programs call pictures of a set, in small letters (MonST3R's masks of what moves, by number; a phone's preview).
+_OF_SETS = re.compile(r"(?:enlarged_)?dynamic_mask_(?P<of>\w+)|thumb(?:nail)?|preview")
 _ONE_CHANNEL = {"L", "P", "1", "I", "F", "I;16", "I;16B", "I;16L"}
 #: Pictures looked at of each kind in a folder; colors of classes, and of a palette of depth, at most; of pixels that
 #: are no background the share that are unit vectors, and how far from 1 their length may be (choices).
@@ -49,6 +53,38 @@ def picture_layers(named: Mapping[str, Path]) -> dict[str, str]:
             reason = f"is a picture of {kind}, by its name and pixels, of"
             found |= {name: f"{reason} {photograph.name} beside it" for name, photograph in beside}
     return found
+
+
+def layer_folders(named: Mapping[str, Path]) -> set[str]:
+    """Folders of pictures by their names that are called as those of depth, classes and the like, where photographs of
+    most of the names in them lie outside of such folders and no camera took what is in them."""
+    inside, outside = dict[str, dict[str, Path]](), set[str]()
+    for name, file in named.items():
+        path = PurePosixPath(name)
+        depth = next((k for k, part in enumerate(path.parts[:-1], 1) if is_layer_folder(part)), None)
+        if depth is None:
+            outside.add(path.stem.lower())
+        else:
+            inside.setdefault(str(PurePosixPath(*path.parts[:depth])), {})[path.stem.lower()] = file
+    return {
+        folder
+        for folder, files in inside.items()
+        if 2 * len(files.keys() & outside) > len(files) and not any(map(has_camera, list(files.values())[:_LOOKED_AT]))
+    }
+
+
+def unnamed_pictures(named: Mapping[str, Path]) -> dict[str, str]:
+    """Of pictures by their names those that are called as masks or previews that programs write of a whole set
+    (`dynamic_mask_7.png`, `thumbnail.jpg`), of no photograph beside them, with the reason; none where there is nothing
+    else, and where a camera took one."""
+    reasons = dict[str, str]()
+    stems = {(path.parent, path.stem.lower()) for path in named.values()}
+    for name, path in named.items():
+        match = _OF_SETS.fullmatch(path.stem.lower())
+        if match and not (match["of"] and (path.parent, match["of"]) in stems):
+            kind = "a mask" if match["of"] else "a preview"
+            reasons[name] = f"is {kind} by its name, and of no photograph beside it"
+    return reasons if len(reasons) < len(named) and not any(has_camera(named[name]) for name in reasons) else {}
 
 
 def _key(stem: str) -> str:

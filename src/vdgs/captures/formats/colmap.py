@@ -83,6 +83,16 @@ def read_colmap(folder: Path, strict: bool = False) -> ColmapModel:
     return ColmapModel(folder, views, points.positions, points.colors, notes)
 
 
+def read_lenses(folder: Path) -> list[Intrinsics]:
+    """The cameras of the sparse model in `folder`, without its images. Raises as `read_colmap`."""
+    suffix = _format(folder)
+    file = folder / f"cameras{suffix}"
+    try:
+        return list((read_cameras_binary if suffix == ".bin" else read_cameras_text)(file).values())
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+
+
 def count_images(folder: Path) -> int:
     """How many registered images the model announces, without reading it all (-1 if unreadable)."""
     try:

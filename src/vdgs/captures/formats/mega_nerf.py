@@ -35,6 +35,7 @@ from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 from vdgs.system.permissions import refusal
+from vdgs.system.quoting import shell_word
 
 #: Ground axes (right, forward, up) from DRB axes.
 GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -68,7 +69,8 @@ def read_mega_nerf(root: Path, options: CaptureOptions, needs_points: bool = Tru
         warnings = refuse_many_missing(missing, len(views) + len(missing), root, options.strict)
     except CaptureError as error:
         raise CaptureError(
-            f"{error}\n(For UrbanScene3D, copy the raw photographs as Mega-NeRF's README says.)"
+            f"{error}\n(For UrbanScene3D, Mega-NeRF's copy_images.py makes them of the raw photographs: python "
+            f"scripts/copy_images.py --image_path PHOTOGRAPHS --dataset_path {shell_word(root)})"
         ) from None
     lost = [name for name in missing if name.startswith(f"{TEST_FOLDER}/")]
     tests = [view for view in views if view.split == "test"]
