@@ -7,7 +7,7 @@ training and test photographs or masks, that is read (choice). A note says which
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from vdgs.captures.formats.colmap import (
     larger_models_beside,
     partial_model,
     read_colmap,
+    read_lenses,
 )
 from vdgs.captures.formats.llff import is_llff, read_llff
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
@@ -26,7 +27,7 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.mvsnet import is_mvsnet, read_mvsnet
 from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.captures.formats.project_photographs import image_root
-from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, SourceView, no_points
+from vdgs.captures.formats.source_capture import NoTiePoints, SourceCapture, no_points
 from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, is_transforms, read_transforms
 from vdgs.captures.image_files import find_images
@@ -159,8 +160,7 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
     if distinct:
         sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
         warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
-    model = read_colmap(folder, options.strict)
-    images, image_warnings = image_folder(root, options, _is_bent(model.views))
+    images, image_warnings = image_folder(root, options, _is_bent(folder))
     for larger in larger_models_beside(root, folder):
         warnings.append(
             f"{larger.relative_to(root)} holds {count_images(larger)} images, and {folder.relative_to(root)}, which is "
@@ -169,6 +169,7 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
         )
     if has_both_kinds(folder):
         warnings.append(f"{folder.relative_to(root) / 'images.bin'} is read; images.txt beside it is not.")
+    model = read_colmap(folder, options.strict)
     warnings += model.notes
     if not model.views:
         raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
@@ -192,13 +193,13 @@ def _read_colmap(root: Path, options: CaptureOptions, needs_points: bool) -> Sou
 
 def use_image_folder(source: SourceCapture, root: Path, name: str) -> SourceCapture:
     """A COLMAP capture that was read without `--images`, with the photographs of another folder."""
-    _, notes = image_folder(root, CaptureOptions(), _is_bent(source.views))
+    _, notes = image_folder(root, CaptureOptions(), _is_bent(_biggest(find_models(root))))
     kept = tuple(note for note in source.warnings if note not in notes)
     return replace(source, images=name, image_folders=(root / name,), warnings=kept)
 
 
-def _is_bent(views: Sequence[SourceView]) -> bool:
-    return any(view.intrinsics.is_distorted for view in views)
+def _is_bent(model: Path) -> bool:
+    return any(lens.is_distorted for lens in read_lenses(model))
 
 
 #: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.

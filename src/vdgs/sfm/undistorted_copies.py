@@ -122,8 +122,8 @@ def _may_be_one(one: ImageMetadata, other: ImageMetadata) -> bool:
         return False
     if not (one.is_bare or other.is_bare) and one.camera != other.camera:
         return False
-    stops = one.exposure_stops, other.exposure_stops
-    if None not in stops and abs(np.subtract(*stops)) >= SAME_STOPS:
+    stops, others = one.exposure_stops, other.exposure_stops
+    if stops is not None and others is not None and abs(stops - others) >= SAME_STOPS:
         return False
     factors = [a / b for a, b in zip(one.size, other.size, strict=True)]
     return all(_SIZES <= factor <= 1 / _SIZES for factor in factors)
@@ -154,7 +154,7 @@ def _features(path: Path) -> _Features:
             gray = np.asarray(small)
     except (OSError, SyntaxError, ValueError):
         return _Features(np.zeros((0, 2)), None)
-    points, descriptors = cv2.SIFT_create(_FEATURES).detectAndCompute(gray, None)
+    points, descriptors = cv2.SIFT.create(_FEATURES).detectAndCompute(gray, None)
     places = np.array([point.pt for point in points]).reshape(-1, 2) + 0.5
     return _Features((places - np.divide(gray.shape[::-1], 2)) / max(gray.shape), descriptors)
 

@@ -84,13 +84,14 @@ def read_colmap(folder: Path, strict: bool = False) -> ColmapModel:
 
 
 def read_lenses(folder: Path) -> list[Intrinsics]:
-    """The cameras of the sparse model in `folder`, without its images. Raises as `read_colmap`."""
+    """The cameras of the sparse model in `folder` that are sound, without its images. Raises as `read_colmap`."""
     suffix = _format(folder)
     file = folder / f"cameras{suffix}"
     try:
-        return list((read_cameras_binary if suffix == ".bin" else read_cameras_text)(file).values())
+        cameras = (read_cameras_binary if suffix == ".bin" else read_cameras_text)(file).values()
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    return [camera for camera in cameras if isinstance(camera, Intrinsics)]
 
 
 def count_images(folder: Path) -> int:
