@@ -111,3 +111,10 @@ def test_parts_of_a_divided_project_are_all_named(tmp_path, scene):
     assert follow(str(refused.value))[1].images is None  # its own photographs lie beside it
     others = "submodels/submodel_0001, submodels/submodel_0002"
     assert f"(beside it: {others}; a run is of one)" in str(refused.value)
+
+
+def test_a_model_far_below_is_named(tmp_path, scene):
+    """As workspaces of COLMAP and caches of Meshroom lie in the folder of a survey."""
+    write_images(tmp_path / "photographs", scene)
+    write_colmap(tmp_path / "processing/2024/colmap/town/dense", scene)
+    assert f"{tmp_path / 'processing/2024/colmap/town/dense'} is a capture" in str(model_below(tmp_path))

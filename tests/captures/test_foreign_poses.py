@@ -141,7 +141,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ("5a.txt", "https://x.org/a\n0 0.9 1.2 0.5 0.5 0 0 1 0 0 2 0 1 0 3 0 0 1 4\n", "of RealEstate10K"),
         ("labels.csv", "image_path,rotation_matrix,translation_vector\n", "Image Matching Challenge"),
         ("camera/1.json", '{"orientation": [[1, 0, 0], [0, 1, 0]], "focal_length": 9}', "poses of Nerfies"),
-        ("images.txt", "1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n\n", "of COLMAP without their lenses"),
+        ("old_images.txt", "1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n\n", "of COLMAP without their lenses"),
         ("pose_left.txt", turned("{x} 2 {y} 0 {s} 0 {c}"), "positions and quaternions"),
         ("results.txt", turned("{k}.jpg {c} 0 {s} 0 {x} 1 {y}"), "positions and quaternions"),
         ("map_camera_poses.txt", turned("17.{k} {x} 2 {y} 0 {s} 0 {c} {k}"), "positions and quaternions"),
@@ -249,8 +249,8 @@ def test_a_kind_of_files_is_named_once(tmp_path):
         ("angles.dat", "time omega phi kappa\n1 2 3 4\n"),
         ("imu.csv", "timestamp,gx,gy,gz,ax,ay,az,qw,qx,qy,qz\n1,2,3,4,5,6,7,1,0,0,0\n"),
         ("heading.csv", "image,x,y,z,qw,qx,qy,qz\n"),
-        ("cloud.txt", turned("{x} {y} {k} {s} {c} 0 0")),
-        ("cloud.csv", turned("{x},{y},{k},{s},0.0,{c},0.012")),
+        ("cloud.txt", "1 2 3 0.48 0.64 0.6 0\n2 1 4 0.6 0.48 0.64 0\n3 5 4 0.64 0.6 0.48 0\n"),
+        ("cloud.csv", "1,2,3,0.48,0.64,0.6,0.012\n2,1,4,0.6,0.48,0.64,0.02\n3,5,4,0.64,0.6,0.48,0.01\n"),
         ("imu.csv", "t,ax,ay,az,qw,qx,qy,qz\n" + turned("{k},{x},2,{y},0,{s},0,{c}")),
         ("rtk.txt", turned("{k}.jpg 47.120{k} 8.5 4{x} 0 {s} 0 {c}")),
         ("quality.csv", turned("{k}.jpg,{x}00,{y},12.5,-60,0.5,{k}5.5")),
@@ -258,10 +258,10 @@ def test_a_kind_of_files_is_named_once(tmp_path):
         ("sums.txt", "".join(f"{k}d41d8cd98f00b204e9800998ecf8427  {k}.jpg\n" for k in range(5))),
         (
             "tileset.json",
-            '{"geometricError": 5, "transform": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 4, 5, 6, 1], "fx": 1}',
+            '{"geometricError": 5, "a": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 4, 5, 6, 1], "fx": 1}',
         ),
         ("exif.json", '[{"GPSLatitude": [47, 7, 12.5], "Matrix": [1, 0, 0, 0, 1, 0, 0, 0, 1], "focal": 9}]'),
-        ("path.json", '{"keyframes": [{"matrix": "[0,1,0,0,-1,0,0,0,0,0,1,0,4,5,6,1]"}], "render_height": 9}'),
+        ("path.json", '{"keyframes": [{"matrix": [0,1,0,0,-1,0,0,0,0,0,1,0,4,5,6,1]}], "fx": 1, "render_height": 9}'),
     ],
 )
 def test_texts_that_only_look_like_poses_are_not_named(tmp_path, name, text):
