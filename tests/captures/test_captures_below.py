@@ -127,3 +127,10 @@ def test_a_mega_nerf_set_without_photographs_names_the_script_that_makes_them(tm
     assert words == [str(tmp_path / "photos"), *2 * [str(tmp_path / "set")]]
     with pytest.raises(CaptureError, match=r"copy_images\.py --image_path PHOTOGRAPHS"):
         read_source(tmp_path / "set", CaptureOptions())
+
+
+def test_a_model_far_below_is_named(tmp_path, scene):
+    """As workspaces of COLMAP and caches of Meshroom lie in the folder of a survey."""
+    write_images(tmp_path / "photographs", scene)
+    write_colmap(tmp_path / "processing/2024/colmap/town/dense", scene)
+    assert f"{tmp_path / 'processing/2024/colmap/town/dense'} is a capture" in str(model_below(tmp_path))

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from support.captures import tiny_scene, write_images
+from vdgs.captures.foreign_poses import foreign_kind, foreign_poses
+from vdgs.captures.formats.json_poses import axis_rotation
 from vdgs.captures.loading import load_capture
-from vdgs.captures.nested_captures import foreign_poses
 from vdgs.captures.project_formats import is_project
 from vdgs.errors import CaptureError
 from vdgs.sfm.image_list import collect_images
+
+
+def turned(row: str) -> str:
+    """Four rows of a camera that turns and moves (x, y), by the sine and cosine of its half angle."""
+    turns = [(k, 0.28 if k % 2 else 0.6, 0.96 if k % 2 else 0.8) for k in range(1, 5)]
+    return "".join(row.format(k=k, s=s, c=c, x=k + 0.5, y=2.5 * k * k) + "\n" for k, s, c in turns)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +131,40 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
         ),
         ("flight.r3d", '<?xml version="1.0"?>\n<Regard3D version="1"/>', "a project of Regard3D; OpenMVG"),
         ("film.r3d", "PK\x03\x04 and so on, for some bytes", "a capture of Record3D"),
+        ("map.graph", "VERTEX3 0 1.5 2 3 0.1 0.2 0.3\n", "a graph of poses"),
+        ("poses.txt", "VERTEX_SE3:QUAT 0 1.5 2 3 0 0.6 0 0.8\n", "a graph of poses"),
+        ("place.zep", "any bytes, and more of them", "a project of 3DF Zephyr"),
+        ("drive/oxts/data/0000000001.txt", "49.0 8.4 112 0.03 0.01 -0.5\n", "of KITTI's raw data"),
+        ("cams_meta.npy", "NUMPY, and what follows is not looked at", "of F2-NeRF"),
+        ("metadata", '{"h": 960, "perFrameIntrinsicCoeffs": [[0, 0, 0, 1]', "poses of Record3D"),
+        ("dataset_train.txt", "Visual Landmark Dataset V1\nImageFile, Camera Position [X Y Z W P Q R]\n", "PoseNet"),
+        ("5a.txt", "https://x.org/a\n0 0.9 1.2 0.5 0.5 0 0 1 0 0 2 0 1 0 3 0 0 1 4\n", "of RealEstate10K"),
+        ("labels.csv", "image_path,rotation_matrix,translation_vector\n", "Image Matching Challenge"),
+        ("camera/1.json", '{"orientation": [[1, 0, 0], [0, 1, 0]], "focal_length": 9}', "poses of Nerfies"),
+        ("old_images.txt", "1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n\n", "of COLMAP without their lenses"),
+        ("pose_left.txt", turned("{x} 2 {y} 0 {s} 0 {c}"), "positions and quaternions"),
+        ("results.txt", turned("{k}.jpg {c} 0 {s} 0 {x} 1 {y}"), "positions and quaternions"),
+        ("map_camera_poses.txt", turned("17.{k} {x} 2 {y} 0 {s} 0 {c} {k}"), "positions and quaternions"),
+        ("ARposes.txt", turned("17{k},0,{s},0,{c},{x},{y},3"), "positions and quaternions"),
+        ("poses.csv", "f,p_x,p_y,p_z,q0,q1,q2,q3\n" + turned("{k},{x},2,{y},0,{s},0,{c}"), "positions and quaternions"),
+        (
+            "extrinsic.txt",
+            "frame r1,1 t3\n" + turned("{k} 0 {c} -{s} 0 {x} {s} {c} 0 {y} 0 0 1 3 0 0 0 1"),
+            "rotation matrix",
+        ),
+        ("rt.csv", turned("{k}.jpg,{c};-{s};0;{s};{c};0;0;0;1,{x};{y};3"), "rotation matrix"),
+        ("town.log", turned("{k}.png,{x}00,{k}00,90,-60,0,{k}5.5"), "UrbanScene3D"),
+        (
+            "cameras.json",
+            '{"a": [[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]], "fx": 9}',
+            "poses as matrices",
+        ),
+        (
+            "cameras.json",
+            '{"cameraTransform": [[0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 4, 5, 6, 1],\n'
+            "[0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 4, 5, 6, 1]]}",
+            "poses as matrices",
+        ),
         ("AT/sfm_geo_desc.json", '{"is_georeferenced": true, "x": 1}', "BlocksExchange"),
     ],
 )
@@ -137,6 +179,30 @@ def test_files_that_only_their_beginning_tells_are_said(tmp_path, name, text, sa
         return
     with pytest.raises(CaptureError, match=rf"{Path(name).name}: is .*{says}"):
         load_capture(tmp_path / name)
+
+
+def test_arrays_of_poses_are_told_by_their_numbers_without_pickle(tmp_path):
+    turns = np.stack([axis_rotation(2, 10.0 * k) for k in range(4)])
+    poses = np.concatenate([turns, np.arange(12.0).reshape(4, 3, 1)], axis=2)
+    np.save(tmp_path / "poses.npy", poses)
+    np.savez(tmp_path / "0001.npz", pose=np.eye(4), intrinsics=np.eye(3))
+    np.save(tmp_path / "points.npy", np.arange(60.0).reshape(5, 12))
+    np.savez(tmp_path / "features.npz", descriptors=poses)
+    np.save(tmp_path / "objects.npy", np.array([{"pose": 1}, None], dtype=object), allow_pickle=True)
+    (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04" + 60 * b"x")
+    (tmp_path / "damaged.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': " + 60 * b"x")
+    named = {file.name for file in tmp_path.iterdir() if foreign_kind(file)}
+    assert named == {"poses.npy", "0001.npz"}
+
+
+def test_of_a_long_series_of_files_few_are_opened(tmp_path, monkeypatch):
+    for k in range(40):
+        (tmp_path / f"DJI_{k:04}.txt").write_text("a text of this photograph, and no poses")
+    opened = list[Path]()
+    real = Path.open
+    monkeypatch.setattr(Path, "open", lambda self, *args, **kinds: opened.append(self) or real(self, *args, **kinds))
+    assert foreign_poses(tmp_path) == []
+    assert 0 < len(opened) < 5
 
 
 def test_other_texts_of_numbers_are_no_poses(tmp_path):
@@ -183,6 +249,19 @@ def test_a_kind_of_files_is_named_once(tmp_path):
         ("angles.dat", "time omega phi kappa\n1 2 3 4\n"),
         ("imu.csv", "timestamp,gx,gy,gz,ax,ay,az,qw,qx,qy,qz\n1,2,3,4,5,6,7,1,0,0,0\n"),
         ("heading.csv", "image,x,y,z,qw,qx,qy,qz\n"),
+        ("cloud.txt", "1 2 3 0.48 0.64 0.6 0\n2 1 4 0.6 0.48 0.64 0\n3 5 4 0.64 0.6 0.48 0\n"),
+        ("cloud.csv", "1,2,3,0.48,0.64,0.6,0.012\n2,1,4,0.6,0.48,0.64,0.02\n3,5,4,0.64,0.6,0.48,0.01\n"),
+        ("imu.csv", "t,ax,ay,az,qw,qx,qy,qz\n" + turned("{k},{x},2,{y},0,{s},0,{c}")),
+        ("rtk.txt", turned("{k}.jpg 47.120{k} 8.5 4{x} 0 {s} 0 {c}")),
+        ("quality.csv", turned("{k}.jpg,{x}00,{y},12.5,-60,0.5,{k}5.5")),
+        ("identity.txt", 5 * "a.jpg 1 0 0 0 1 0 0 0 1 4 5 6\n"),
+        ("sums.txt", "".join(f"{k}d41d8cd98f00b204e9800998ecf8427  {k}.jpg\n" for k in range(5))),
+        (
+            "tileset.json",
+            '{"geometricError": 5, "a": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 4, 5, 6, 1], "fx": 1}',
+        ),
+        ("exif.json", '[{"GPSLatitude": [47, 7, 12.5], "Matrix": [1, 0, 0, 0, 1, 0, 0, 0, 1], "focal": 9}]'),
+        ("path.json", '{"keyframes": [{"matrix": [0,1,0,0,-1,0,0,0,0,0,1,0,4,5,6,1]}], "fx": 1, "render_height": 9}'),
     ],
 )
 def test_texts_that_only_look_like_poses_are_not_named(tmp_path, name, text):

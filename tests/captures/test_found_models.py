@@ -12,8 +12,17 @@ import pytest
 
 from support.advice import advised_words
 from support.captures import TinyScene, tiny_scene, write_colmap, write_images, write_ply
-from support.dataset_layouts import DRB, OPENGL, halves, write_blender, write_matrixcity, write_mega_nerf
+from support.dataset_layouts import (
+    DRB,
+    OPENGL,
+    halves,
+    write_blender,
+    write_matrixcity,
+    write_mega_nerf,
+)
 from vdgs.captures.format_dispatch import lacks_points
+from vdgs.captures.formats.colmap import partial_model
+from vdgs.captures.formats.json_poses import axis_rotation
 from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import is_capture
 from vdgs.config.capture_options import CaptureOptions
@@ -334,7 +343,7 @@ def test_poses_by_another_name_than_transforms_json_say_what_to_call_them(tmp_pa
     write_transforms(tmp_path, scene)
     (tmp_path / "transforms.json").rename(tmp_path / "mine.json")
     for given in (tmp_path, tmp_path / "mine.json"):
-        with pytest.raises(CaptureError, match=r"mine\.json: .*rename it to transforms\.json, which is read"):
+        with pytest.raises(CaptureError, match=r"mine\.json: .*as transforms\.json in a folder of its own it is read"):
             load_capture(given)
 
 
@@ -422,3 +431,40 @@ def test_photographs_in_two_folders_beside_a_model_are_all_offered(tmp_path, sce
     with pytest.raises(CaptureError, match=r"; --images \. for those of train and val together\.$"):
         load_capture(tmp_path)
     assert len(load_capture(tmp_path, CaptureOptions(images=".", up="z")).views) == len(scene.cameras)
+
+
+def test_a_list_of_photographs_is_no_part_of_a_model(tmp_path, scene):
+    write_images(tmp_path, scene)
+    (tmp_path / "images.txt").write_text("\n".join(sorted(file.name for file in tmp_path.iterdir())))
+    assert partial_model(tmp_path) == ""
+    (tmp_path / "images.txt").write_text("# Image list with two lines of data per image:\n")
+    assert "no cameras.txt" in partial_model(tmp_path)
+    (tmp_path / "images.txt").write_text("1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n\n")
+    assert "no cameras.txt" in partial_model(tmp_path)
+
+
+def test_cameras_as_ns_export_writes_them_say_what_is_read(tmp_path, scene):
+    write_images(tmp_path, scene)
+    (tmp_path / "transforms_train.json").write_text('[{"file_path": "a.png", "transform": [[1, 0, 0, 0]]}]')
+    with pytest.raises(CaptureError, match=r"ns-export cameras.*Give the folder of that"):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("degrees", [0, 90])
+def test_points_of_a_model_whose_cameras_are_rolled_are_refused(tmp_path, scene, degrees):
+    """Camera centers agree, and the photographs would be taken for turned ones."""
+    write_colmap(tmp_path, scene)
+    write_transforms(tmp_path, scene)
+    (tmp_path / "sparse_pc.ply").unlink()
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    turn = np.eye(4)
+    turn[:3, :3] = axis_rotation(2, degrees)
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    options = CaptureOptions(format="transforms")
+    if not degrees:
+        assert len(load_capture(tmp_path, options).points) == len(scene.points)
+        return
+    with pytest.raises(CaptureError, match=r"turned against them by 90°.*all alike"):
+        load_capture(tmp_path, options)

@@ -149,7 +149,8 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
     ("changes", "message"),
     [
         ({"frames": []}, "none"),
-        ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
+        ({"frames": [{"file_path": "images/frame_000.png", "c2w": []}]}, "has no 'transform_matrix' .*'c2w'"),
+        ({"frames": [{"file_path": "images/frame_000.png", "transform_matrix": [1] * 16}]}, "4 lists of 4"),
         ({"frames": [frame(np.diag([2.0, 1, 1, 1]))]}, r"orthonormal \(scaled or sheared\).*Blender.*Ctrl-A"),
         ({"frames": [frame(np.eye(4), "../gone.png")]}, "inside the capture.*--images FOLDER"),
         ({"frames": [frame(np.eye(4), "images/no.png")]}, r"1 of 1 images .* are missing(?s:.)*no\.png"),

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from vdgs.captures.foreign_poses import foreign_poses
 from vdgs.captures.formats.colmap import (
     count_images,
     find_models,
@@ -32,7 +33,7 @@ from vdgs.captures.formats.sparse_points import POINT_CLOUDS, find_point_cloud
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, exclusive_information, is_transforms, read_transforms
 from vdgs.captures.image_files import find_images
 from vdgs.captures.image_places import image_folder
-from vdgs.captures.nested_captures import foreign_poses, model_below
+from vdgs.captures.nested_captures import model_below
 from vdgs.captures.project_formats import PROJECTS, find_projects, is_project, read_project
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run

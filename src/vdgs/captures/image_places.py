@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from vdgs.captures.folders_below import folders_below
 from vdgs.captures.formats.colmap import find_models, read_lenses
 from vdgs.captures.formats.transforms import TRANSFORMS_FILE, read_transforms
 from vdgs.captures.image_files import find_images, readable_suffixes
 from vdgs.captures.name_resolution import largest_shrunk, match_stem
-from vdgs.captures.nested_captures import folders_below
 from vdgs.captures.strays import (
     is_mask_folder,
     is_result,

@@ -35,8 +35,6 @@ class TableBeside(NamedTuple):
     photographs: int
     problem: str = ""
     """Why one of photographs that are there, or ODM's own, cannot be used."""
-    holds_poses: bool = False
-    """Whether it holds poses of another program instead."""
 
 
 def position_tables(
@@ -55,7 +53,7 @@ def position_tables(
             if is_told or file.name.lower() == ODM_POSITIONS:
                 found.append(TableBeside(file, 0, str(error)))
         except HoldsPoses as error:
-            found += [TableBeside(file, 0, str(error), holds_poses=True)] if without_system else []
+            found += [TableBeside(file, 0, str(error))] if without_system else []
         except CaptureError as error:  # mostly some other text
             found += [TableBeside(file, 0, str(error))] if file.name.lower() == ODM_POSITIONS else []
     return sorted(

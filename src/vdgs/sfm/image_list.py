@@ -9,12 +9,13 @@ from functools import cache, partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
+from vdgs.captures.foreign_poses import foreign_poses
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source_capture import format_list
 from vdgs.captures.image_files import decode_image
 from vdgs.captures.image_suffixes import HEIF_SUFFIXES, IMAGE_SUFFIXES, PROXY_SUFFIXES, RAW_SUFFIXES
 from vdgs.captures.name_resolution import jpeg_name, match_key
-from vdgs.captures.nested_captures import check_no_foreign_file, foreign_poses, model_below
+from vdgs.captures.nested_captures import check_no_foreign_file, model_below
 from vdgs.captures.output_guard import is_capture
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.strays import check_no_run, walk

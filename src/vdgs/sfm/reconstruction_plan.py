@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from vdgs.captures.foreign_poses import foreign_kind
 from vdgs.captures.output_guard import check_output
 from vdgs.captures.reconstruction import (
     DIGESTS_FILE,
@@ -107,7 +108,10 @@ def _with_tables_beside(request: SfmRequest, collection: ImageList) -> tuple[Sfm
         )
         return replace(request, gps=used.file), notes
     read = [folder.resolve() for folder in collection.folders]  # where poses of other programs are named already
-    tables = [each for each in tables if not each.holds_poses or not {*read} & {*each.file.resolve().parents}]
+    tables = [
+        each for each in tables
+        if not (each.problem and {*read} & {*each.file.resolve().parents} and foreign_kind(each.file))
+    ]  # fmt: skip
     notes += [table_note(table, number) for table in tables]
     return request, notes if tables or placed >= MIN_POSITIONS else [*notes, *track_notes(folders)]
 

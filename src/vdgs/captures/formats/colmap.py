@@ -8,8 +8,10 @@ neither crash the process nor exhaust memory. Layout: https://colmap.github.io/f
 from __future__ import annotations
 
 import os
+import re
 import struct
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -32,6 +34,8 @@ from vdgs.captures.formats.source_capture import (
 from vdgs.errors import CaptureError
 
 QUATERNION_TOLERANCE = 1e-3
+#: How the rows of images.txt and of cameras.txt begin: numbers, a quaternion and a translation; a lens and a size.
+_IMAGE_ROW, _CAMERA_ROW = re.compile(r"\d+(\s+[-+.\deE]+){7}\s+\d+\s+\S"), re.compile(r"\d+\s+[A-Z_]{3,}\s+\d+\s+\d+")
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,11 +162,27 @@ def partial_model(root: Path) -> str:
     for folder in _candidates(root):
         for suffix in (".bin", ".txt"):
             files = {stem: folder / (stem + suffix) for stem in ("cameras", "images")}
-            missing = [file.name for file in files.values() if not file.is_file()]
-            if len(missing) == 1:
-                present = next(file.name for file in files.values() if file.is_file())
-                return f"{folder} holds {present} but no {missing[0]} that can be read: copy the whole model. "
+            present = [file for file in files.values() if file.is_file()]
+            if len(present) == 1 and _may_be_of_model(present[0]):
+                missing = next(file.name for file in files.values() if file not in present)
+                return f"{folder} holds {present[0].name} but no {missing} that can be read: copy the whole model. "
     return ""
+
+
+def _may_be_of_model(file: Path) -> bool:
+    """Whether a text begins as COLMAP's, where others call a list of photographs so too (`ls > images.txt`); True for
+    other files."""
+    if file.suffix != ".txt":
+        return True
+    try:
+        with file.open(encoding="utf-8-sig", errors="replace") as stream:
+            lines = [line.strip() for line in islice(stream, 20)]
+    except OSError:
+        return True
+    kind = "image list" if file.stem == "images" else "camera list"
+    row = _IMAGE_ROW if file.stem == "images" else _CAMERA_ROW
+    first = next((line for line in lines if line and not line.startswith("#")), "")
+    return bool(row.match(first)) or any(line.startswith("#") and kind in line.lower() for line in lines)
 
 
 def _format(folder: Path) -> str | None:

@@ -40,6 +40,8 @@ from vdgs.captures.text_tables import read_text
 from vdgs.errors import CaptureError
 from vdgs.system.documents import JsonObject
 
+#: So many keys of a frame are named in messages.
+_SAID_KEYS = 8
 #: Camera axes: OpenGL (right, up, back) from OpenCV (right, down, forward); its own inverse.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 #: A rotation that is longer or shorter by more than this share is scaled; rounding makes less.
@@ -65,8 +67,19 @@ def read_capture_json(file: Path) -> JsonObject:
     """The object in a JSON file. Raises `CaptureError` for anything else."""
     content = read_json_text(file, "Export it again.")
     if not isinstance(content, dict):
-        raise CaptureError(f"{file}: must hold a JSON object.")
+        raise CaptureError(f"{file}: must hold a JSON object with a list 'frames'{_found_instead(content)}")
     return content
+
+
+def _found_instead(content: object) -> str:
+    """What a JSON file holds instead of an object, and what is read."""
+    first = content[0] if isinstance(content, list) and content else None
+    if isinstance(first, dict) and {"file_path", "transform"} <= first.keys():
+        return (
+            ", and is a list as ns-export cameras of nerfstudio writes it, without lenses. The transforms.json or "
+            "COLMAP model that the training was of is read. Give the folder of that."
+        )
+    return f", not {'a list' if isinstance(content, list) else 'this'}. Export it again."
 
 
 def read_json_text(file: Path, remedy: str) -> Any:
@@ -84,6 +97,25 @@ def get_frames(content: JsonObject, file: Path, key: str = "frames") -> list[Jso
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise CaptureError(f"{file}: must hold a list {key!r} of posed images, and it has none.")
     return frames
+
+
+def matrix_of_frame(frame: JsonObject, file: Path, label: str, *keys: str) -> np.ndarray:
+    """The matrix of a frame [4, 4] by the first of the keys that it has, `transform_matrix` if none is given. Raises
+    `BadPose`, which says what the frame has instead."""
+    keys = keys or ("transform_matrix",)
+    value = next((frame[key] for key in keys if frame.get(key) is not None), None)
+    if value is None:
+        has = ", ".join(map(repr, list(frame)[:_SAID_KEYS])) or "nothing"
+        raise BadPose(
+            f"{file}: {label} has no {keys[0]!r} (it has {has}). Write its pose there: world from camera, 4 rows of 4 "
+            "numbers, axes of OpenGL (x right, y up, z back)."
+        )
+    if isinstance(value, list) and len(value) in (12, 16) and not any(isinstance(each, list) for each in value):
+        raise BadPose(
+            f"{file}: {label} has a matrix as one list of {len(value)} numbers. Write it as 4 lists of 4, row by row, "
+            "with the place in the last column."
+        )
+    return parse_matrix(value, file, label)
 
 
 def parse_matrix(value: object, file: Path, label: str) -> np.ndarray:

@@ -23,8 +23,8 @@ from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
     mask_of_frame,
+    matrix_of_frame,
     parse_intrinsics,
-    parse_matrix,
     read_capture_json,
 )
 from vdgs.captures.formats.source_capture import (
@@ -213,7 +213,7 @@ def _read_frame(
 ) -> tuple[SourceView, float]:
     """A view, and the unit of its world in metres if the file is MatrixCity's."""
     label = str(frame.get("file_path", frame.get("frame_index", "?")))
-    matrix = parse_matrix(frame.get("transform_matrix", frame.get("rot_mat")), file, f"frame {label}")
+    matrix = matrix_of_frame(frame, file, f"frame {label}", "transform_matrix", "rot_mat")
     norm = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     scaled = abs(norm / BLOCK_ROTATION - 1) < 0.01
     if scaled:

@@ -22,6 +22,8 @@ POINT_CLOUDS = (
 )  # fmt: skip
 #: A COLMAP model fits the poses if camera centers agree to this share of their spread (RMS).
 MAX_RELATIVE_RMS = 0.02
+#: And if the cameras look the same way, in degrees (median).
+MAX_TURN_DEG = 10.0
 
 
 def find_sparse_points(
@@ -43,7 +45,7 @@ def find_sparse_points(
     maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
     that its cameras do not replace `poses`; `images` is the folder that `--images` names; `placed` brings the points
     of a PLY into that world where they are in another. Raises `NoTiePoints` if there is nothing, unless nothing
-    `needs_points`, and `CaptureError` if there is nothing that fits.
+    `needs_points`, and `CaptureError` if there is nothing that fits, in camera centers and in rotations.
     """
     cloud = find_point_cloud(root)
     if cloud is not None:
@@ -83,7 +85,28 @@ def find_sparse_points(
             f"{folder}: its camera positions disagree with those of {what} (RMS {rms:.3g} over a spread of "
             f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
         )
+    turned = {view.name: view.camera_from_world[:3, :3] for view in model.views}
+    agreeing = [pair for pair, is_in in zip(pairs, inliers, strict=True) if is_in]
+    turns = [poses[b][:3, :3] @ similarity.rotation @ turned[a].T for a, b in agreeing]
+    _check_turns(np.array(turns), folder, what)
     return similarity.apply(model.points), model.colors
+
+
+def _check_turns(turns: np.ndarray, folder: Path, what: str) -> None:
+    """Raise CaptureError where cameras of the model look elsewhere than those of the poses, or are rolled against
+    them: `turns` [n, 3, 3] are from each camera of the model to that of the poses, and the identity for right ones."""
+    cosines = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
+    angle = float(np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1)))))
+    if angle <= MAX_TURN_DEG:
+        return
+    alike = np.linalg.norm(turns - np.median(turns, axis=0), axis=(1, 2)) < np.radians(MAX_TURN_DEG)
+    says = "all alike: the axes of the cameras are of another convention" if alike.mean() > 0.9 else "not all alike"
+    raise CaptureError(
+        f"{folder}: its cameras are where those of {what} are, but turned against them by {angle:.0f}° ({says}). One "
+        "of the two is wrong. Axes of cameras are to be those of the format (in transforms.json x right, y up, z back, "
+        "world from camera): export the poses again. Or move the poses away, and the model is read as it is, or the "
+        "model, and its points are found anew."
+    )
 
 
 def _read_placed(cloud: Path, placed: Callable[[np.ndarray, Path], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from vdgs.captures.formats.json_poses import (
     camera_motion,
     get_frames,
     mask_of_frame,
+    matrix_of_frame,
     parse_intrinsics,
     parse_matrix,
     parse_number,
@@ -106,7 +107,7 @@ def read_transforms(root: Path, options: CaptureOptions, needs_points: bool = Tr
             continue
         short += image.suffix if image.stem == PurePosixPath(short).name else ""
         try:
-            matrix = parse_matrix(frame.get("transform_matrix"), file, f"frame {name!r}")
+            matrix = matrix_of_frame(frame, file, f"frame {name!r}")
             in_file = camera_motion(matrix, file, f"frame {name!r}")
         except BadPose as error:
             bad[short] = error
