@@ -93,6 +93,13 @@ def test_poses_above_the_folder_of_photographs_are_named_as_poses(tmp_path):
     assert "To use it" not in told
 
 
+def test_poses_that_are_named_already_are_not_told_as_positions_too(tmp_path):
+    """Both notes spoke of --gps, and one denied what the other said."""
+    text = "image,x,y,z,qw,qx,qy,qz\n{0},1,2,3,1,0,0,0\n{1},2,2,3,1,0,0,0\n{2},2,9,3,1,0,0,0\n"
+    (told,) = planned(tmp_path, "card/cameras.csv", text, placed=True)[1]
+    assert told.startswith("not read: cameras.csv: positions and quaternions")
+
+
 @pytest.mark.parametrize("name", ["card/geo.txt", "geo.txt"])
 def test_the_table_of_odm_is_used_where_photographs_say_no_positions(tmp_path, name):
     priors, (said,) = planned(tmp_path, name, TABLES[name], placed=False)
