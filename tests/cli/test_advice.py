@@ -38,6 +38,8 @@ OF_OTHERS = {
     "nvrtc.py": {"--gpu-architecture"},
     "cli/main.py": {"--version"},
     "config_file.py": {"--no"},  # the beginning of a switch
+    "mega_nerf.py": {"--image", "--dataset"},  # --image_path and --dataset_path of its script
+    "nested_captures.py": {"--image", "--dataset"},
 }  # fmt: skip
 
 #: Tables of options, and style sheets, whose variables look like options.
