@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.xdist_group("layers")  # one worker reads all sources
+
 ROOT = Path(__file__).parents[1]
 PACKAGE, EXPERIMENTS = ROOT / "src" / "vdgs", ROOT / "experiments"
 

@@ -14,7 +14,7 @@ from vdgs.cli.advice import COMMAND, OPTION, Advice, flags_of
 from vdgs.cli.main import COMMANDS, verb_arguments
 from vdgs.system.exit_codes import exit_code_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.xdist_group("advice"), pytest.mark.slow]
 
 SOURCE = Path(vdgs.__file__).parent
 #: Options of other programs, by the end of the file that names them.

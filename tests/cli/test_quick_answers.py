@@ -27,7 +27,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_inputs import are_inputs_unchanged, note_inputs
 from vdgs.system.similar_paths import suggest_path
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.xdist_group("quick_answers"), pytest.mark.slow]
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy", "sklearn", "shapely", "rasterio", "PIL")
 #: A command line of each verb with an input that is mistyped: the folder `DCIM` or the run `flight`.

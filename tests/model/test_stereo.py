@@ -27,7 +27,7 @@ from vdgs.model.initialization.stereo import (
 from vdgs.model.initialization.stereo.fusion import CELL_SCALES, MIN_SPACING
 from vdgs.model.initialization.stereo.rectification import RectifiedPair
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.xdist_group("stereo"), pytest.mark.slow]
 
 HEIGHT, ROOF, HALF = 20.0, 4.0, 5.0  # of the flight, of a roof about the origin, and half its edge
 SLOPE = 0.05

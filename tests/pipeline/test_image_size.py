@@ -26,7 +26,7 @@ from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.system.processor_time import Cost
 
-pytestmark = pytest.mark.slow  # whole reconstructions, runs or trainings
+pytestmark = [pytest.mark.xdist_group("image_size"), pytest.mark.slow]  # whole reconstructions, runs or trainings
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ from vdgs.rendering.ortho.tile_renderer import (
 )
 from vdgs.visibility.visibility_counts import count_visibility
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.xdist_group("ortho"), pytest.mark.slow]
 
 rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")

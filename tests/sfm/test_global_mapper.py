@@ -23,7 +23,7 @@ from vdgs.sfm import focal_decision, global_mapper, incremental_mapper, mapping 
 from vdgs.sfm.feature_matching import count_verified_matches  # noqa: E402
 from vdgs.sfm.workspace import Workspace, silence_colmap  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.xdist_group("global_mapper"), pytest.mark.slow]
 
 WIDTH, HEIGHT, FOCAL, ALTITUDE = 1000, 800, 1000.0, 100.0
 CONSOLE = Console(quiet=True)

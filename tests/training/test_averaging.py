@@ -15,7 +15,7 @@ from vdgs.system.checkpoints import load_latest_checkpoint, save_checkpoint
 from vdgs.training import from_checkpoint, to_checkpoint, train_step, training_loop
 from vdgs.training.weight_averaging import NUM_AVERAGED_MODELS, is_averaged_step
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.xdist_group("averaging"), pytest.mark.slow]
 
 #: Growth ends at iteration 30, the mean begins after 36.
 MEAN = replace(CONFIG, swa_fraction=0.4, densify=replace(CONFIG.densify, stop_fraction=0.5))
