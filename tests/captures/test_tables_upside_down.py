@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
 from vdgs.captures.ground_estimation import find_ground_frame
@@ -32,12 +33,16 @@ def flight(rows: int, columns: int, slope_deg: float = 0.0) -> tuple[np.ndarray,
     return centers, np.column_stack([ground, rise * ground[:, 1] + generator.normal(size=400)])
 
 
-def capture_of(centers: np.ndarray, points: np.ndarray, turned: np.ndarray | None = None) -> SourceCapture:
+def capture_of(
+    centers: np.ndarray, points: np.ndarray, turned: np.ndarray | None = None, view: np.ndarray | None = None
+) -> SourceCapture:
+    """In a world that is `turned`; `view` [3, 3] or [n, 3, 3] turns cameras from looking straight down."""
     turned = np.eye(3) if turned is None else turned
+    all_looking = np.broadcast_to(DOWN if view is None else view @ DOWN, (len(centers), 3, 3))
     views = []
-    for k, center in enumerate(centers):
+    for k, (center, looking) in enumerate(zip(centers, all_looking, strict=True)):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = DOWN @ turned.T, -DOWN @ center
+        pose[:3, :3], pose[:3, 3] = looking @ turned.T, -looking @ center
         views.append(SourceView(name=f"{k:03d}.jpg", camera_from_world=pose, intrinsics=LENS))
     colors = np.zeros((len(points), 3), np.uint8)
     return SourceCapture(source="colmap", images="images", views=tuple(views), points=points @ turned.T, colors=colors)
@@ -112,6 +117,35 @@ def test_heights_over_a_slope_are_seen_where_all_photographs_look_one_way(tmp_pa
     frame, warnings = placed(tmp_path, scene, geodetic)
     assert frame.rotation[2, 2] > np.cos(np.radians(4))
     assert any("its altitudes are all about 360" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("share", [-0.01, 0.01])
+def test_a_stretched_model_is_no_slope(tmp_path, share):
+    """Altitudes that are good to centimetres and nearly one for all are those of a level flight."""
+    centers, points = flight(10, 10)
+    centers[:, 2] = 60 + 0.3 * np.random.default_rng(0).normal(size=len(centers))
+    there_and_back = Rotation.from_euler("z", 180.0 * (np.arange(len(centers)) // 10 % 2)[:, None], degrees=True)
+    stretched = [1 + share, 1, 1]
+    table = write_table(tmp_path / "t.csv", positions_of(centers, noise=0.02))
+    seen = capture_of(centers * stretched, points * stretched, view=there_and_back.as_matrix())
+    frame, warnings = find_ground_frame(seen, tmp_path, CaptureOptions(gps=table))
+    assert frame.rotation[2, 2] > np.cos(np.radians(1))
+    assert not any("its altitudes are all about" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("pitch_deg", [-50, -65])
+@pytest.mark.parametrize("knows_altitudes", [True, False])
+def test_a_line_of_oblique_views_is_level_as_its_ground_is(tmp_path, pitch_deg, knows_altitudes):
+    """The mean view is far from down there, and positions along a line do not tell by how much it is rolled."""
+    centers, points = flight(20, 1)
+    geodetic = positions_of(centers, noise=1.0)
+    geodetic[:, 2] = geodetic[:, 2] if knows_altitudes else np.nan
+    seen = capture_of(centers, points, view=Rotation.from_euler("x", -90 - pitch_deg, degrees=True).as_matrix())
+    frame, warnings = find_ground_frame(seen, tmp_path, CaptureOptions(gps=write_table(tmp_path / "t.csv", geodetic)))
+    assert frame.metric
+    assert frame.scale == pytest.approx(1, abs=0.01)
+    assert frame.rotation[2, 2] > np.cos(np.radians(5))
+    assert any("what is level across it is by flat ground" in warning for warning in warnings)
 
 
 def test_rows_that_are_not_used_are_told(tmp_path):

@@ -402,6 +402,17 @@ def test_the_makers_calibration_survives_a_rewritten_size():
     assert 1 / AGREE < lens.focal / 0.667 < AGREE
 
 
+def test_a_calibration_of_a_shrunk_photograph_is_as_good_as_its_center_lies_in_the_middle_of_the_longer_side():
+    """40 px off the middle down are more of the height than 10 across are of the width."""
+    xmp = packet(
+        'drone-dji:CalibratedFocalLength="3666.6" drone-dji:CalibratedOpticalCenterX="2746.0" '
+        'drone-dji:CalibratedOpticalCenterY="1784.0"'
+    )
+    lens = read_lens({}, {0xA002: 1368, 0xA003: 912}, xmp, 1368, 912)
+    assert lens is not None
+    assert lens.focal == pytest.approx(3666.6 / 5472, rel=0.005)
+
+
 ADOBE = "Adobe Photoshop Lightroom 6.0 (Windows)"
 
 

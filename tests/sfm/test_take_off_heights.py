@@ -60,6 +60,14 @@ def test_a_film_that_begins_on_the_ground_keeps_its_heights(altitude):
     assert np.ptp(found.enu[:, 2]) == pytest.approx(40, abs=0.1)
 
 
+def test_heights_of_few_positions_that_are_not_used_are_not_said_to_be():
+    others = [photo(f"photos/p_{k}", 10.0 * k, None, None) for k in range(30)]
+    found = read_gps_priors([*film(20), *others], None, (1.5, 3.0))
+    assert len(found) == 50
+    assert not found.has_altitudes
+    assert not any("heights over the take-off are used" in note for note in found.notes)
+
+
 @pytest.mark.parametrize(("frames", "photographs"), [(20, 1), (20, 8), (8, 20)])
 def test_frames_without_altitudes_beside_photographs_with_both_are_as_high_as_those_tell(frames, photographs):
     found = read_gps_priors([*film(frames), *survey(photographs)], None, (1.5, 3.0))

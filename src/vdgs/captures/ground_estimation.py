@@ -39,7 +39,15 @@ from vdgs.captures.position_weights import are_told, relative_deviations, weighi
 from vdgs.captures.reconstruction import by_axis, told_up
 from vdgs.captures.tables_beside import position_tables, table_note
 from vdgs.captures.turned_views import are_turned_over
-from vdgs.captures.up_axis import HINT, MAX_UP_DEVIATION_DEG, OR_CEILING, contradict_up, estimate_up, up_by_views
+from vdgs.captures.up_axis import (
+    HINT,
+    MAX_UP_DEVIATION_DEG,
+    OR_CEILING,
+    VIEWS_DEG,
+    contradict_up,
+    estimate_up,
+    up_by_views,
+)
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import camera_centers
@@ -61,6 +69,9 @@ UPSIDE_DOWN_DEG = 120.0
 MIN_POSITIONS = 3
 #: Nor do cameras that differ by no more than this share of their coordinates: rounding.
 ONE_PLACE = 1e-12
+#: By what up is known for a fit; and views that tell it no better than to so many degrees (one standard deviation) all
+#: look one way, at a slant: twice what they are off where they look down. Flat ground tells it as well as that.
+BY_VIEWS, LEANING_DEG = "the views", 2 * VIEWS_DEG
 #: Estimates of a fit's scale are no better than its arithmetic and rounded positions allow (share; choice).
 LEAST_SCALE_ERROR = 1e-4
 AXES = {
@@ -265,7 +276,7 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     problem, doubt = with_likelier_up(by_views)
     if doubt:
         warnings.append(f"{file.name}: {doubt}. If that is wrong, leave --gps out, and {HINT}")
-    fit = _fit_table(problem, geodetic[:, 2], file, warnings)
+    fit, problem = _fit_of_positions(scene, problem, geodetic[:, 2], file, warnings)
     _refuse_upside_down(scene, by_views, fit, file)
     refused = fit.why_refused(file.name)
     if refused:
@@ -296,10 +307,30 @@ def _problem(scene: _Scene, positions: GpsPositions, enu: np.ndarray) -> Problem
     return Problem(
         centers=scene.centers[positions.images], targets=enu,
         times=_taken_in_order([scene.names[i] for i in positions.images]),
-        up=Up(views.direction, views.deviation_deg, "the views", views.sure, other=views.other),
+        up=Up(views.direction, views.deviation_deg, BY_VIEWS, views.sure, other=views.other),
         has_altitudes=positions.has_altitudes, stated=deviations if are_told(deviations, said) else None,
         relative=relative_deviations(deviations),
     )  # fmt: skip
+
+
+def _fit_of_positions(
+    scene: _Scene, problem: Problem, altitudes: np.ndarray, file: Path, warnings: list[str]
+) -> tuple[PositionFit, Problem]:
+    """The fit to a table, and what was known for it: where positions along one line leave open what is level across it,
+    and the views lean away from what is up over flat ground, the ground tells that better than they do."""
+    said = list[str]()
+    fit = _fit_table(problem, altitudes, file, said)
+    if problem.up.deviation_deg > LEANING_DEG and problem.up.how == BY_VIEWS and _is_on_a_line(fit, problem):
+        up, _ = estimate_up(scene.centers, scene.rotations, scene.points, [])
+        level = Up(up, LEANING_DEG, "flat ground", problem.up.sure, other=problem.up.other)
+        problem, said = replace(problem, up=level), []
+        fit = _fit_table(problem, altitudes, file, said)
+    warnings += said
+    return fit, problem
+
+
+def _is_on_a_line(fit: PositionFit, problem: Problem) -> bool:
+    return is_nearly_collinear(problem.targets[fit.inliers], fit.deviations[fit.inliers])
 
 
 def _refuse_mirrored(problem: Problem, file: Path) -> None:
@@ -333,8 +364,7 @@ def _refuse_upside_down(scene: _Scene, problem: Problem, fit: PositionFit, file:
 def _checked_on_a_line(fit: PositionFit, problem: Problem, file: Path, warnings: list[str]) -> tuple[PositionFit, bool]:
     """The fit with what positions along one line leave open, which it says, and whether they are: across the line the
     views alone tell what is level."""
-    trusted = fit.inliers
-    if not is_nearly_collinear(problem.targets[trusted], fit.deviations[trusted]):
+    if not _is_on_a_line(fit, problem):
         return fit, False
     fit, notes = checked_on_a_line(fit, problem)
     warnings += [f"{file.name}: {note}" for note in notes]

@@ -26,6 +26,9 @@ HELD_DEG, BOTH_WITHIN = 1e-3, 2.45
 #: Positions of a flight at about one height tell up where it would be off by so many times more without them: heights
 #: differ by less than this share of how far cameras spread (choice).
 TELL_BETTER, ONE_HEIGHT = 1.5, 0.15
+#: Models are stretched by up to 2 % one way (rolling shutters, lenses): to positions that are good to centimetres that
+#: is a tilt of 11 degrees, which three of these standard deviations contain (choice).
+STRETCHED_DEG = 4.5
 #: Positions lie along one line where they spread across it by less than this share of how far along it (choice), or as
 #: errors do.
 ONE_LINE = 0.05
@@ -64,7 +67,8 @@ def fit_positions(problem: Problem) -> PositionFit:
     starts = _upright_starts(problem)
     if problem.has_altitudes and problem.up.sure and len(problem.centers) >= ENOUGH_TO_DOUBT:
         plane = _settle_in_plane(replace(problem, has_altitudes=False))
-        tilt_deg = min(problem.up.deviation_deg, plane.level_error_deg / BOTH_WITHIN)  # views of one way tell it worse
+        by_plane_deg = max(STRETCHED_DEG, plane.level_error_deg / BOTH_WITHIN)
+        tilt_deg = min(problem.up.deviation_deg, by_plane_deg)  # views of one way tell it worse
         if are_over_ground(problem.targets[:, 2], plane.placed, tilt_deg):
             return plane
     if problem.has_altitudes and not is_collinear(problem.centers):

@@ -325,6 +325,8 @@ def _whole_side(side: float, center: Sequence[float], focal: float, hints: _Hint
     whole = min(factors) * side
     if abs(whole / side - 1) < OFF_MIDDLE:
         return side
+    if max(factors) / min(factors) < 1 + OFF_MIDDLE:  # the smaller is that of the side where the center is farther off
+        whole = factors[0] * side
     if not 1 / AGREE < whole / side < AGREE:
         return whole
     tolerance = EVEN if abs(whole / side - 1) < 2 * OFF_MIDDLE else OFF_MIDDLE  # so far off the middle lies no center

@@ -56,7 +56,7 @@ def with_take_off_heights(
     if not used.any():
         return geodetic, kinds, []
     take_offs = (altitudes - heights)[own & np.isfinite(heights)]
-    if own.any() and not len(take_offs):
+    if not len(take_offs):
         if 2 * used.sum() < known.sum():
             return geodetic, kinds, []
         found[own, 2] = np.nan
