@@ -127,6 +127,7 @@ def _round(count: int) -> np.ndarray:
         (_ending(0.5), Fit.SHORT),
         (_ending(0.95), Fit.UNCLEAR),
         (_ending(1 / 0.96), Fit.BESIDE),
+        (_ending(1.0) + np.array([10.0, 7.5]), Fit.UNCLEAR),  # of a lens whose principal point is off the middle
         (_ending(2.0, 50), Fit.BESIDE),
         (_ending(0.5, 200), Fit.UNCLEAR),
         (_ending(0.5, 50), Fit.FITS),  # too few to tell

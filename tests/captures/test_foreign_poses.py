@@ -153,7 +153,7 @@ def test_poses_of_formats_that_are_not_read_are_said(tmp_path, name):
             "rotation matrix",
         ),
         ("rt.csv", turned("{k}.jpg,{c};-{s};0;{s};{c};0;0;0;1,{x};{y};3"), "rotation matrix"),
-        ("town.log", turned("{k}.png,{x}00,{k}00,90,-60,0,{k}5.5"), "UrbanScene3D"),
+        ("town.log", turned("{k}.png,{x}00,{k}00,90,-60,0,{k}5.5"), "UrbanScene3D.*--gps FILE"),
         (
             "cameras.json",
             '{"a": [[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]], "fx": 9}',

@@ -95,6 +95,12 @@ def test_photographs_that_were_shrunk_on_purpose_are_used(tmp_path, size):
     assert fitted(tmp_path, size, 0.005).width == size[0]
 
 
+def test_photographs_whose_shorter_side_is_round_are_used(tmp_path):
+    assert fitted(tmp_path, (3868, 2900), 0.005).width == 3868
+    with pytest.raises(CaptureError, match="which would be undistorted once more"):
+        fitted(tmp_path, (3865, 2899), 0.005)
+
+
 def test_photographs_all_but_as_large_as_a_bent_camera_by_a_round_number_are_remarked(tmp_path, scene):
     cameras = {name: camera.resized(66, 49) for name, camera in scene.cameras.items()}
     write_colmap(tmp_path, replace(scene, cameras=cameras), images=None, **BENT)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +29,7 @@ from vdgs.captures.formats.source_capture import NoTiePoints
 from vdgs.captures.loading import read_files
 from vdgs.captures.project_formats import read_project
 from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 
 OPTIONS = CaptureOptions()
@@ -67,6 +70,25 @@ def test_an_export_tells_which_of_several_projects_is_meant(tmp_path: Path) -> N
     write_project(tmp_path, flight, suffix=".psz")
     (tmp_path / "cameras.xml").write_text(metashape_xml(flight))
     assert_true(read_project(tmp_path, "metashape", OPTIONS, needs_points=False), flight)
+
+
+def test_an_export_tells_which_of_several_chunks_is_meant(tmp_path: Path) -> None:
+    """Where the active chunk has no cameras that are aligned, as one that was just begun."""
+    flight = true_flight(count=4)
+    flight.touch(tmp_path)
+    write_project(tmp_path, flight)
+    folder = tmp_path / "project.files"
+    shutil.copytree(folder / "0", folder / "1")
+    chunks = "".join(f'<chunk id="{number}" path="{number}/chunk.zip"/>' for number in (0, 1))
+    with zipfile.ZipFile(folder / "project.zip", "w") as archive:
+        archive.writestr("doc.xml", f'<document version="1.2.0"><chunks active_id="2">{chunks}</chunks></document>')
+    with pytest.raises(CaptureError, match="2 chunks have cameras"):
+        read_project(tmp_path, "metashape", OPTIONS)
+    (tmp_path / "cameras.xml").write_text(metashape_xml(flight))
+    assert_true(read_project(tmp_path, "metashape", OPTIONS, needs_points=False), flight)
+    with pytest.raises(NoTiePoints) as raised:
+        read_project(tmp_path, "metashape", OPTIONS)
+    assert "give the project itself" not in str(raised.value)
 
 
 # -------------------------------------------------------------------------------------------------- cameras

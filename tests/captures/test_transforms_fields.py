@@ -74,6 +74,9 @@ def test_a_lens_without_a_size_is_of_the_size_that_its_principal_point_says(tmp_
         ((2000.0, 1500.0), (640, 480), (4000, 3000)),  # the middle, whatever the factor
         ((2736.0, 1824.0), (640, 427), (5472, 3648)),
         ((4096.0, 2730.0), (1600, 1066), (8192, 5460)),
+        ((787.0, 591.0), (1600, 1200), (1600, 1200)),  # rounded, and of no size that photographs have
+        ((392.0, 392.5), (800, 800), (800, 800)),
+        ((796.0, 446.5), (2985, 1674), (1592, 893)),  # no multiple is likely
     ],
 )
 def test_the_nearest_whole_factor_is_the_size_of_a_lens_off_the_middle(lens, size, expected):

@@ -188,7 +188,7 @@ _BY_CONTENT = (
 _ROTATIONS = f"a rotation matrix and a place in each row; {_WRITE}"
 _TRAJECTORY = f"positions and quaternions without lenses, a trajectory; {_WRITE}"
 _MATRICES = f"poses as matrices; {_WRITE}"
-_ANGLES = f"positions and angles of cameras (UrbanScene3D) without lenses; {_WRITE}"
+_ANGLES = f"positions and angles of cameras without lenses (drones, UrbanScene3D); {_WRITE}{_POSITIONS}"
 #: Suffixes of texts of numbers.
 _TEXTS = frozenset({".txt", ".csv", ".tsv", ".log", ".dat", ".tum", ".kitti", ".pose", ".poses", ".trajectory", ".gt"})
 #: Suffixes of tables of poses that any program may have written.

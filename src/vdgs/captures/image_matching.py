@@ -41,6 +41,8 @@ MAX_UNDISTORTED_DEVIATION = 0.1
 #: People shrink photographs to widths that are multiples of these numbers of pixels, or by such shares (choice: one
 #: undistorted width in ten is, too).
 ROUND_PX, ROUND_SHARE = (16, 50), 0.05
+#: The same for the shorter side, which people give more rarely: coarser (3840x2160 to 3640x2048; 720, 1080 and 1440).
+ROUND_SHORTER_PX = (64, 100, 360)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +216,8 @@ def _is_undistorted_size(size: tuple[int, int], camera: tuple[int, int]) -> bool
     longer, whole = max(size), max(camera)
     by_share = abs(longer - round(longer / whole / ROUND_SHARE) * ROUND_SHARE * whole) < ROUNDING_PX
     is_enlarged = longer > whole or min(size) > min(camera)
-    return is_enlarged or not (by_share or any(longer % step == 0 for step in ROUND_PX))
+    is_round = any(longer % step == 0 for step in ROUND_PX) or any(min(size) % step == 0 for step in ROUND_SHORTER_PX)
+    return is_enlarged or not (by_share or is_round)
 
 
 def _shrunk_otherwise(photographs: list[MatchedView]) -> list[str]:

@@ -42,8 +42,8 @@ class Fit(Enum):
     FITS = 0
     """They reach to the rims."""
     UNCLEAR = 1
-    """They end before the rims, or some lie beside them, but that may also be of lenses that were undone, of masks and
-    of objects, or of programs that look for no points at the rims."""
+    """They end before the rims, or some lie beside them, but that may also be of lenses that were undone or are off the
+    middle, of masks and of objects, or of programs that look for no points at the rims."""
     SHORT = 2
     """The photographs are larger than those that were aligned."""
     BESIDE = 3
@@ -122,7 +122,8 @@ def fit_of(pixels: np.ndarray, size: tuple[int, int]) -> tuple[Fit, float]:
     if is_few or (reach >= WHOLE_REACH and outside <= MAX_OUTSIDE):
         return Fit.FITS, reach
     if outside > MAX_OUTSIDE:
-        return (Fit.BESIDE if _fill_a_rectangle(shares, reach, _STRAIGHTER) else Fit.UNCLEAR), reach
+        is_smaller = _fill_a_rectangle(shares, reach, _STRAIGHTER) and not _are_shifted(pixels / half)
+        return (Fit.BESIDE if is_smaller else Fit.UNCLEAR), reach
     if reach >= LEAST_REACH:
         return (Fit.UNCLEAR if _fill_a_rectangle(shares, reach, _STRAIGHTER) else Fit.FITS), reach
     return (Fit.SHORT if _fill_a_rectangle(shares, reach, _STRAIGHT) else Fit.UNCLEAR), reach
@@ -131,6 +132,13 @@ def fit_of(pixels: np.ndarray, size: tuple[int, int]) -> tuple[Fit, float]:
 def _reach(shares: np.ndarray) -> float:
     """The farthest of shares [n] but for strays."""
     return float(np.quantile(shares, 1 - _STRAYS)) if len(shares) else 0.0
+
+
+def _are_shifted(places: np.ndarray) -> bool:
+    """Whether places [n, 2], in halves of the sides, reach from rim to rim of a photograph of the size, but not about
+    its middle: pixels of lenses with another principal point, which COLMAP writes from there."""
+    widths = [(_reach(places[:, axis]) + _reach(-places[:, axis])) / 2 for axis in (0, 1)]
+    return min(widths) >= WHOLE_REACH and max(widths) <= 1
 
 
 def _fill_a_rectangle(shares: np.ndarray, reach: float, straight: float) -> bool:

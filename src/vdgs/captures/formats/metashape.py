@@ -63,9 +63,20 @@ def is_file(file: Path) -> bool:
 
 def find_files(root: Path) -> list[Path]:
     """The whole project of aligned photographs in a folder, which has tie points; else the exports of aligned cameras;
-    of several projects without any, all."""
-    projects = _projects_in(root)
-    return projects if len(projects) == 1 else _exports_in(root) or projects
+    of several projects without any, all. An export also says which of several chunks is meant, where the project does
+    not."""
+    projects, exports = _projects_in(root), _exports_in(root)
+    is_clear = len(projects) == 1 and (not exports or _tells_chunk(projects[0]))
+    return projects if is_clear else exports or projects
+
+
+def _tells_chunk(project: Path) -> bool:
+    """Whether a project can be read, and says which of its chunks is meant."""
+    try:
+        _chosen_chunk(read_chunks(project), project)
+    except CaptureError:
+        return False
+    return True
 
 
 def _projects_in(folder: Path) -> list[Path]:
@@ -85,6 +96,19 @@ def read(file: Path, options: CaptureOptions) -> Project:
     else:
         root = read_xml(file, {name: lambda _: None for name in _UNUSED})
         chunks = [exported_chunk(chunk) for chunk in root.iter("chunk")]
+    chunk, notes = _chosen_chunk(chunks, file)
+    if file.suffix.lower() in PROJECTS:
+        unread = _exports_in(file.parent)
+        notes += [f"of {file.name} and {_names(unread)} beside it the project is read."] if unread else []
+        return _Chunk(chunk, file, notes).project()
+    unread = _projects_in(file.parent)
+    notes += [f"{file.name} is read, not {_names(unread)} beside it, which may be newer."] if unread else []
+    return replace(_Chunk(chunk, file, notes).project(), with_points=tuple(filter(_tells_chunk, unread)))
+
+
+def _chosen_chunk(chunks: Sequence[StoredChunk], file: Path) -> tuple[StoredChunk, list[str]]:
+    """The chunk with aligned cameras that is meant, and a note on others. Raises CaptureError where there is none, or
+    where nothing tells which."""
     aligned = [chunk for chunk in chunks if chunk.element.find(".//camera/transform") is not None]
     if not aligned:
         raise CaptureError(
@@ -99,13 +123,7 @@ def read(file: Path, options: CaptureOptions) -> Project:
         )
     others = [chunk for chunk in enabled if chunk is not active[0]]
     notes = [f"the active chunk {_labels(active)} is read; {_labels(others)} is not."] if others else []
-    if file.suffix.lower() in PROJECTS:
-        unread = _exports_in(file.parent)
-        notes += [f"of {file.name} and {_names(unread)} beside it the project is read."] if unread else []
-        return _Chunk(active[0], file, notes).project()
-    unread = _projects_in(file.parent)
-    notes += [f"{file.name} is read, not {_names(unread)} beside it, which may be newer."] if unread else []
-    return replace(_Chunk(active[0], file, notes).project(), with_points=tuple(unread))
+    return active[0], notes
 
 
 def _names(files: Sequence[Path]) -> str:
