@@ -20,7 +20,7 @@ from vdgs.config.method import LossConfig, block_train_config
 from vdgs.config.presets import PRESETS
 from vdgs.errors import CaptureError, Interrupted, VdgsError
 from vdgs.pipeline import dry_run, image_size, run_estimate, time_estimate
-from vdgs.pipeline.image_size import ImageSize, choose_image_size, image_sizes, largest_suitable
+from vdgs.pipeline.image_size import ImageSize, choose_image_size, count_views, image_sizes, largest_suitable
 from vdgs.pipeline.time_estimate import Growth, StepTimes, measure_textures
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
@@ -142,6 +142,11 @@ def test_texture_is_measured_at_each_size(capture):
         cv2.imwrite(str(view.image_path), np.repeat(board[..., None], 3, axis=2))
     found = measure_textures(views, [1.0, 2.0])
     assert found[1.0] > 100 > 1 > found[2.0]
+
+
+def test_photographs_that_are_left_out_take_no_time():
+    assert count_views(2000, CaptureOptions()) == (1750, 250)
+    assert count_views(2000, CaptureOptions(max_images=50, test_every=10)) == (45, 5)
 
 
 def test_the_largest_that_time_and_memory_allow_is_taken():

@@ -20,6 +20,7 @@ from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.settings_file import read_settings_file, settings_text
+from vdgs.system.atomic_files import write_json
 from vdgs.system.quoting import shell_word
 
 
@@ -143,3 +144,19 @@ def test_a_file_without_settings_changes_none(tmp_path):
     assert read(tmp_path / "empty.yaml") == (CaptureOptions(), MethodConfig())
     text = settings_text(CaptureOptions(), MethodConfig())
     assert list(yaml.safe_load(text)) == ["capture", "training", "partition", "assignment", "block", "merge"]
+
+
+@pytest.mark.parametrize(("steps", "asked_for"), [(3000, 0), (7200, 0), (4000, 4000)])
+def test_steps_that_follow_from_photographs_follow_from_others_again(tmp_path, steps, asked_for):
+    """Of the run that is there, and of its settings as a file for another."""
+    views, run = [f"{k}.jpg" for k in range(120 if steps == 7200 else 29)], RunFolder(tmp_path / "run")
+    method = PRESETS["laptop"]
+    method = replace(method, training=replace(method.training, iterations=steps))
+    (tmp_path / "capture").mkdir()
+    run.create_or_check(RunSettings.create(tmp_path / "capture", CaptureOptions(), method))
+    write_json(run.capture_file, {"training_views": views})
+    words = [str(tmp_path / "capture"), "--output", str(run.path), "--device", "cpu"]
+    of_run = start_settings(parse_words(RunArguments, words))
+    assert of_run.method.training.iterations == asked_for
+    assert replace(of_run.method, training=method.training) == method
+    assert asked("--config", run.path / "config.yaml").method().training.iterations == asked_for

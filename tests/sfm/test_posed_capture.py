@@ -28,6 +28,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import WORK_FOLDER
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.commands import RunRequest
+from vdgs.config.presets import PRESETS
 from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import ecef_from_geodetic, geodetic_from_enu
@@ -35,11 +36,13 @@ from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.pipeline.dry_run import estimate_run
 from vdgs.pipeline.run_pipeline import reconstruct_if_needed
 from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import RunSettings
 from vdgs.sfm import feature_extraction, feature_matching, posed_capture, workspace
 from vdgs.sfm.posed_capture import make_posed_capture
 from vdgs.sfm.posed_photographs import FEATURES, _in_metres, read_posed_photographs
 from vdgs.sfm.posed_plan import plan_posed_capture
 from vdgs.sfm.random_points import random_points
+from vdgs.sfm.run_request import size_apart
 from vdgs.sfm.workspace import Workspace
 from vdgs.system.atomic_files import write_json
 
@@ -415,3 +418,13 @@ def test_metres_of_mega_nerf_and_the_city_stay() -> None:
     again = view.camera_from_world[:3, :3] @ (100 * down @ point) + view.camera_from_world[:3, 3]
     np.testing.assert_allclose(again, 100 * in_camera, atol=1e-9)
     assert moved.georef is not None
+
+
+def test_a_size_that_a_run_chose_is_that_of_its_own_capture(tmp_path: Path) -> None:
+    """The same command again reads it from the run's settings: no folder of the project is meant."""
+    project, run, asked = tmp_path / "project", RunFolder(tmp_path / "run"), CaptureOptions(images="images_2")
+    (project / "images_2").mkdir(parents=True)
+    request = RunRequest(capture=project, output=run.path, preset="laptop", options=asked)
+    assert size_apart(request) == (request, None)
+    run.create_or_check(RunSettings.create(run.own_capture.resolve(), asked, PRESETS["laptop"]))
+    assert size_apart(request) == (replace(request, options=CaptureOptions()), "images_2")

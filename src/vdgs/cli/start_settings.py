@@ -9,9 +9,11 @@ from typing import Any
 
 from vdgs.cli.argument_parser import GivenArguments
 from vdgs.config.capture_options import CaptureOptions
-from vdgs.config.method import MethodConfig
+from vdgs.config.method import MethodConfig, TrainConfig, resolve_iterations
 from vdgs.config.options import with_values
 from vdgs.config.presets import NEW_RUN_PRESET, PRESETS, PresetName
+
+_STEPS = ("training", "iterations")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,7 @@ def start_settings(given: GivenArguments) -> StartSettings:
         from vdgs.runs.settings_file import read_settings_file
 
         of_capture, of_method = read_settings_file(file)
+        of_method = {path: 0 if _are_by_count(file.parent, path, value) else value for path, value in of_method.items()}
         options, method = with_values(options, of_capture), with_values(method, of_method)
     return StartSettings(preset=preset, options=options, method=method, reason=reason)
 
@@ -60,7 +63,20 @@ def _own_settings(output: Path | None, capture: Path | None) -> Any:
     from vdgs.runs.run_folder import RunFolder
 
     own = RunFolder(output).settings()
+    if _are_by_count(output, _STEPS, own.method.training.iterations):
+        own = with_values(own, {_STEPS: 0})
     return own if capture is None else own.moved(capture.resolve())
+
+
+def _are_by_count(run: Path, path: Any, value: Any) -> bool:
+    """Whether a setting of the run in a folder is the steps of its coarse stage, and these are as many as follow from
+    its photographs: of other photographs they follow again."""
+    if path != _STEPS:
+        return False
+    from vdgs.system.atomic_files import read_json_or_empty
+
+    views = read_json_or_empty(run / "capture.json").get("training_views")
+    return isinstance(views, list) and value == resolve_iterations(TrainConfig(iterations=0), len(views)).iterations
 
 
 def _device_of_new_run(device: str) -> str:

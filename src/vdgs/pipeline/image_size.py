@@ -105,10 +105,9 @@ def choose_for_photographs(
             if factor <= min(full.width, full.height)
         ]
     with tempfile.TemporaryDirectory(prefix="vdgs-") as folder:
-        count = len(plan.image_list.images)
-        tested = -(-count // request.options.test_every)
+        trained, tested = count_views(len(plan.image_list.images), request.options)
         timed = assumed_capture(plan, options, sfm.points, Path(folder))
-        scene = Scene(timed, [camera] * (count - tested), tested, sfm.points)
+        scene = Scene(timed, [camera] * trained, tested, sfm.points)
         if plan.preflight.views_per_point:
             scene = replace(scene, views_per_point=plan.preflight.views_per_point)
         if named:
@@ -117,6 +116,13 @@ def choose_for_photographs(
         chosen, estimate = _choose(scene, sizes, request, console, sfm)
     options = replace(request.options, images=chosen.images, downscale=chosen.downscale)
     return SizeChoice(request=replace(request, options=options), estimate=estimate)
+
+
+def count_views(num_images: int, options: CaptureOptions) -> tuple[int, int]:
+    """How many of so many photographs will train, and how many are kept for testing."""
+    count = min(num_images, options.max_images or num_images)
+    tested = -(-count // options.test_every)
+    return count - tested, tested
 
 
 def with_photographs(estimate: RunEstimate, sfm: SfmEstimate) -> RunEstimate:

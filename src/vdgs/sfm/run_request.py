@@ -56,9 +56,19 @@ def size_apart(request: RunRequest) -> tuple[RunRequest, str | None]:
     named = request.options.images
     if named is None or Path(named).as_posix() not in [name for name, _ in IMAGE_SIZES]:
         return request, None
-    if Path(named).is_dir() or (capture_root(request.capture) / named).is_dir():
+    is_there = Path(named).is_dir() or (capture_root(request.capture) / named).is_dir()
+    if is_there and not _is_size_of_run(request, named):
         return request, None
     return replace(request, options=replace(request.options, images=None)), named
+
+
+def _is_size_of_run(request: RunRequest, named: str) -> bool:
+    """Whether the run that is there reads the capture in its own folder at this size: then its settings say so."""
+    run = RunFolder(request.output)
+    if not run.config_file.exists():
+        return False
+    own = run.settings()
+    return Path(own.capture_path) == run.own_capture.resolve() and own.capture.images == named
 
 
 def print_unused_options(request: RunRequest, console: Console) -> None:
