@@ -137,6 +137,17 @@ def test_every_encoder_writes_a_whole_film(tmp_path: Path, encoder: Encoder):
     assert (caution(encoder) is None) == (encoder in ("ffmpeg", "av"))
 
 
+@pytest.mark.parametrize("encoder", ["ffmpeg", "av", "mpeg4"])
+def test_a_relative_name_may_have_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder: Encoder):
+    needed = {"ffmpeg": ffmpeg_is_there(), "av": importlib.util.find_spec("av"), "mpeg4": True}
+    if not needed[encoder]:
+        pytest.skip(f"nothing here encodes with {encoder}")
+    monkeypatch.chdir(tmp_path)
+    with VideoWriter(Path("2026-11-29T10:30:00.mp4"), 25.0, encoder=encoder) as film:
+        film.write(np.zeros((32, 32, 3), np.uint8))
+    assert [path.name for path in tmp_path.iterdir()] == ["2026-11-29T10:30:00.mp4"]
+
+
 @pytest.mark.parametrize("encoder", ["ffmpeg", "av"])
 @pytest.mark.parametrize("size", [(48, 64), (720, 1280)])
 def test_h264_has_its_colors_by_bt709_and_says_so(tmp_path: Path, encoder: Encoder, size: tuple[int, int]):

@@ -238,7 +238,8 @@ class VideoWriter:
         if path.suffix.lower() != ".mp4":
             raise VdgsError(f"{path}: films are written as MP4; give a name that ends in .mp4.")
         self.path, self.fps, self.encoder = path, fps, encoder or default_encoder()
-        self._partial = path.with_name(f".{path.name}.{process_mark()}.partial.mp4")
+        # absolute: programs take what stands before a colon in a relative name for a protocol
+        self._partial = path.absolute().with_name(f".{path.name}.{process_mark()}.partial.mp4")
         self._shape: tuple[int, ...] | None = None
         self._frames = 0
         self._pen: _Pen | None = None
