@@ -82,6 +82,7 @@ def test_without_a_map_coordinates_are_local(tmp_path):
     read = laspy.read(tmp_path / "a.laz")
     np.testing.assert_allclose(read.xyz, some.means.numpy(), atol=0.00051)
     assert read.header.parse_crs() is None
+    assert read.header.global_encoding.wkt
     place = (48.1, 11.6, 512.0)
     registry.write_scene(tmp_path / "a.las", replace(ExportScene.of(some), metadata=ExportMetadata(geodetic=place)))
     assert json.loads((tmp_path / "a.las.json").read_text())["geodetic"] == list(place)

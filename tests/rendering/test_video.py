@@ -61,7 +61,7 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["good.mp4"]
 
 
-@pytest.mark.parametrize("content", [b"x", b"flight over the field" * 1000])
+@pytest.mark.parametrize("content", [b"x", b"flight over the field" * 1000], ids=["a byte", "a film"])
 def test_a_film_of_others_is_not_replaced(tmp_path: Path, content: bytes):
     """It may be the one that the run was made of; it is refused before the model is looked for."""
     file = tmp_path / "DJI_0042.MP4"

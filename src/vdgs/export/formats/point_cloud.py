@@ -147,9 +147,9 @@ def _las_header(path: Path, metadata: ExportMetadata, scale: float) -> laspy.Las
     header.scales = np.full(3, scale)
     header.offsets = np.array(metadata.origin)
     header.generating_software = metadata.program[:32]
+    header.global_encoding.wkt = True  # LAS 1.4 asks for it of point formats from 6 on, with a system or without
     if metadata.crs:
         header.vlrs.append(WktCoordinateSystemVlr(_las_wkt(_crs(path, metadata.crs))[0]))
-        header.global_encoding.wkt = True
     return header
 
 
