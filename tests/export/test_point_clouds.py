@@ -88,6 +88,15 @@ def test_without_a_map_coordinates_are_local(tmp_path):
     assert json.loads((tmp_path / "a.las.json").read_text())["geodetic"] == list(place)
 
 
+def test_what_qgis_made_of_an_earlier_cloud_is_named(tmp_path):
+    scene = partial(ExportScene.of, random_gaussians(5, 0))
+    assert not any("QGIS" in note for note in registry.write_scene(tmp_path / "a.las", scene()))
+    (tmp_path / "a.copc.laz").touch()
+    for name in ("a.las", "a.laz"):
+        assert any(note.startswith("a.copc.laz beside it") for note in registry.write_scene(tmp_path / name, scene()))
+    assert not any("QGIS" in note for note in registry.write_scene(tmp_path / "b.las", scene()))
+
+
 @pytest.mark.parametrize("ending", [".las", ".laz"])
 @pytest.mark.parametrize("kept", [0.05, 0.5, 0.999])
 def test_points_for_which_the_disk_has_no_room_are_reported_and_absent(tmp_path, ending, kept):

@@ -97,6 +97,19 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
+def test_what_programs_made_of_an_earlier_map_goes_with_it(tmp_path):
+    """They would show its statistics and its overviews for those of the new one."""
+    for name in ("dsm.tif.aux.xml", "dsm.tif.ovr", "dsm.tif.msk", "theirs.tif.aux.xml", "dsm.qml"):
+        (tmp_path / name).write_text("of the earlier map")
+    with pytest.raises(ValueError, match="failed"), ortho_plan.staging_folder(tmp_path):
+        raise ValueError("failed")
+    assert (tmp_path / "dsm.tif.aux.xml").is_file()
+    with ortho_plan.staging_folder(tmp_path) as staging:
+        for name in ("dsm.tif", "map.json"):
+            (staging / name).write_text("new")
+    assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "map.json", "theirs.tif.aux.xml", "dsm.qml"}
+
+
 def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_unfinished(house, make, monkeypatch):
     class Killed(BaseException):
         pass

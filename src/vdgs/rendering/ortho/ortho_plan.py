@@ -35,6 +35,8 @@ HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE = "hillshade.png", "orthophoto.png", 
 FILE_NAMES = (
     ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE, METADATA_FILE
 )  # fmt: skip
+#: How the names of files end that QGIS and GDAL lay beside a picture: statistics, overviews and a mask of it.
+_SIDECAR_ENDINGS = (".aux.xml", ".ovr", ".msk")
 #: The folder in a folder of maps where new ones are drawn, by the name that `scratch_folder` takes.
 STAGING = "maps"
 
@@ -146,7 +148,8 @@ def check_output_folder(folder: Path) -> None:
 def staging_folder(folder: Path) -> Iterator[Path]:
     """A folder inside `folder` whose files come to stand in it when all are there; nothing is left if not.
 
-    map.json comes last: while files take their places it says only whose they are. Raises VdgsError, with the remedy,
+    map.json comes last: while files take their places it says only whose they are. What programs have laid beside an
+    earlier file goes with it: they would show its numbers for those of the new one. Raises VdgsError, with the remedy,
     where the disk refuses.
     """
     try:
@@ -158,6 +161,8 @@ def staging_folder(folder: Path) -> Iterator[Path]:
                 write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
                 for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
                     os.replace(file, folder / file.name)
+                    for ending in _SIDECAR_ENDINGS:
+                        (folder / (file.name + ending)).unlink(missing_ok=True)
             except OSError as error:  # rasterio's errors are such too, and GDAL's own words mislead
                 raise reason_of(error, staging) from error
     except OSError as error:
