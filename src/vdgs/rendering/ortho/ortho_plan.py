@@ -25,6 +25,7 @@ from vdgs.rendering.ortho.map_status import METADATA_FILE
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
+from vdgs.rendering.sidecars import remove_sidecars
 from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
@@ -35,8 +36,6 @@ HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE = "hillshade.png", "orthophoto.png", 
 FILE_NAMES = (
     ORTHOPHOTO_FILE, DSM_FILE, VISIBILITY_FILE, HILLSHADE_FILE, PICTURE_FILE, PREVIEW_FILE, METADATA_FILE
 )  # fmt: skip
-#: How the names of files end that QGIS and GDAL lay beside a picture: statistics, overviews and a mask of it.
-_SIDECAR_ENDINGS = (".aux.xml", ".ovr", ".msk")
 #: The folder in a folder of maps where new ones are drawn, by the name that `scratch_folder` takes.
 STAGING = "maps"
 
@@ -161,8 +160,7 @@ def staging_folder(folder: Path) -> Iterator[Path]:
                 write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
                 for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
                     os.replace(file, folder / file.name)
-                    for ending in _SIDECAR_ENDINGS:
-                        (folder / (file.name + ending)).unlink(missing_ok=True)
+                    remove_sidecars(folder / file.name)
             except OSError as error:  # rasterio's errors are such too, and GDAL's own words mislead
                 raise reason_of(error, staging) from error
     except OSError as error:
