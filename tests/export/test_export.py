@@ -239,6 +239,7 @@ def test_what_a_map_says_of_its_system_files_say_too(export, tmp_path: Path, mon
         assert each not in files[3]["notes"]  # on the globe, whatever the map
     assert files[3]["crs_name"].startswith("Earth-centered")
     assert files[3]["heights"] is None
+    assert any("heights on the globe are ellipsoidal (WGS 84)" in each for each in files[3]["notes"])
 
 
 def test_axes_are_named_as_files_record_them_and_heights_only_where_the_third_goes_up(export, tmp_path: Path):

@@ -82,9 +82,19 @@ def test_without_a_map_coordinates_are_local(tmp_path):
     read = laspy.read(tmp_path / "a.laz")
     np.testing.assert_allclose(read.xyz, some.means.numpy(), atol=0.00051)
     assert read.header.parse_crs() is None
+    assert read.header.global_encoding.wkt
     place = (48.1, 11.6, 512.0)
     registry.write_scene(tmp_path / "a.las", replace(ExportScene.of(some), metadata=ExportMetadata(geodetic=place)))
     assert json.loads((tmp_path / "a.las.json").read_text())["geodetic"] == list(place)
+
+
+def test_what_qgis_made_of_an_earlier_cloud_is_named(tmp_path):
+    scene = partial(ExportScene.of, random_gaussians(5, 0))
+    assert not any("QGIS" in note for note in registry.write_scene(tmp_path / "a.las", scene()))
+    (tmp_path / "a.copc.laz").touch()
+    for name in ("a.las", "a.laz"):
+        assert any(note.startswith("a.copc.laz beside it") for note in registry.write_scene(tmp_path / name, scene()))
+    assert not any("QGIS" in note for note in registry.write_scene(tmp_path / "b.las", scene()))
 
 
 @pytest.mark.parametrize("ending", [".las", ".laz"])

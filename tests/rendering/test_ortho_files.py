@@ -18,7 +18,7 @@ from vdgs.config.commands import OrthoRequest
 from vdgs.config.executor_options import ExecutorOptions
 from vdgs.distributed.sharded_job import ExecutionOptions
 from vdgs.errors import VdgsError
-from vdgs.rendering.ortho import map_status, ortho_plan, render_ortho, tile_renderer
+from vdgs.rendering.ortho import geotiff, map_status, ortho_plan, render_ortho, tile_renderer
 from vdgs.rendering.ortho.ortho_plan import OrthoPlan
 from vdgs.runs.open_run import ModelLocation
 from vdgs.runs.run_context import RunContext
@@ -95,6 +95,19 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
                 context, OrthoRequest(run=tmp_path / "run", output=tmp_path / name), Console(quiet=True)
             )
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_what_programs_made_of_an_earlier_map_goes_with_it(tmp_path):
+    """They would show its statistics and its overviews for those of the new one."""
+    for name in ("dsm.tif.aux.xml", "dsm.tif.ovr", "dsm.tif.msk", "theirs.tif.aux.xml", "dsm.qml"):
+        (tmp_path / name).write_text("of the earlier map")
+    with pytest.raises(ValueError, match="failed"), ortho_plan.staging_folder(tmp_path):
+        raise ValueError("failed")
+    assert (tmp_path / "dsm.tif.aux.xml").is_file()
+    with ortho_plan.staging_folder(tmp_path) as staging:
+        for name in ("dsm.tif", "map.json"):
+            (staging / name).write_text("new")
+    assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "map.json", "theirs.tif.aux.xml", "dsm.qml"}
 
 
 def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_unfinished(house, make, monkeypatch):
@@ -177,6 +190,30 @@ def test_a_map_that_fails_leaves_the_old_one_whole(house, make, monkeypatch):
     with pytest.raises(VdgsError, match=r"No space left on device.*maps that were there are kept"):
         make(*house, gsd=0.4)
     assert {file.name: file.read_bytes() for file in ortho_folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["PROJ_LIB", "PROJ_DATA", None])
+def test_the_catalogue_of_another_proj_is_named_before_anything_is_drawn(house, make, monkeypatch, name):
+    """Conda, OSGeo4W and PostGIS set such a variable."""
+    import rasterio
+
+    def fail(*_: object) -> None:
+        raise rasterio.errors.CRSError("no database context specified")
+
+    monkeypatch.setattr(geotiff, "require_rasterio", lambda: SimpleNamespace(crs=SimpleNamespace(CRS=UnknownSystems)))
+    monkeypatch.setattr(UnknownSystems, "from_user_input", fail, raising=False)
+    monkeypatch.setattr(tile_renderer.TileRenderer, "render_tile", lambda *_: pytest.fail("drawn"))
+    for each in ("PROJ_LIB", "PROJ_DATA"):
+        monkeypatch.delenv(each, raising=False)
+    if name is not None:
+        monkeypatch.setenv(name, "/usr/share/proj")
+    remedy = "pip install -U rasterio" if name is None else rf"by {name} \(/usr/share/proj\)\. Run `unset {name}`"
+    with pytest.raises(VdgsError, match=rf"EPSG:32632: rasterio does not know.*no database context.*{remedy}"):
+        make(*house, gsd=0.5, crs="EPSG:32632")
+
+
+class UnknownSystems:
+    """A `rasterio.crs.CRS` that knows none."""
 
 
 def test_without_rasterio_the_remedy_is_named(house, make, monkeypatch):

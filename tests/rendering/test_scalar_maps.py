@@ -59,6 +59,18 @@ def test_a_second_render_takes_the_place_of_the_first(tmp_path: Path) -> None:
     assert (tmp_path / "r" / ".DS_Store").is_file()
 
 
+def test_what_systems_and_programs_leave_is_no_reason_to_refuse(tmp_path: Path) -> None:
+    rendered(tmp_path, ["00000.png", "00001.png"])
+    picture(systems := ["Thumbs.db", "desktop.ini", "._00000.png"], tmp_path)
+    (tmp_path / "@eaDir").mkdir()
+    picture(["00000.png.aux.xml", "00001.png.aux.xml"], tmp_path)
+    rendered(tmp_path, ["00000.png"])
+    assert {path.name for path in tmp_path.iterdir()} == {*systems, "@eaDir", "00000.png", "render.json"}
+    picture(["theirs.png.aux.xml", "thumb_1.png"], tmp_path)
+    with pytest.raises(VdgsError, match=r"no render wrote \(theirs\.png\.aux\.xml, thumb_1\.png\)"):
+        render_folder.begin_render(tmp_path, ["thumb_1.png"])
+
+
 def test_what_no_render_wrote_is_never_touched(tmp_path: Path) -> None:
     rendered(tmp_path, ["a.png"])
     picture(["mine.png"], tmp_path, b"mine")

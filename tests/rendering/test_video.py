@@ -10,9 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
+from vdgs.config.commands import RenderRequest
 from vdgs.errors import VdgsError
 from vdgs.rendering import video
+from vdgs.rendering.render_run import render_run
 from vdgs.rendering.video import Encoder, VideoWriter, caution, check_film, default_encoder
 from vdgs.system.atomic_files import host_mark, process_mark
 
@@ -56,6 +59,30 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
     with pytest.raises(VdgsError, match=r"\.mp4"):
         VideoWriter(tmp_path / "film.avi", 30.0)
     assert [path.name for path in tmp_path.iterdir()] == ["good.mp4"]
+
+
+@pytest.mark.parametrize("content", [b"x", b"flight over the field" * 1000], ids=["a byte", "a film"])
+def test_a_film_of_others_is_not_replaced(tmp_path: Path, content: bytes):
+    """It may be the one that the run was made of; it is refused before the model is looked for."""
+    file = tmp_path / "DJI_0042.MP4"
+    file.write_bytes(content)
+    with pytest.raises(VdgsError, match=r"DJI_0042\.MP4: is there already, and no film of `vdgs render`"):
+        render_run(RenderRequest(run=tmp_path / "run", output=file), Console())
+    with pytest.raises(VdgsError, match="Choose another name"), VideoWriter(file, 30.0, encoder="mpeg4") as film:
+        film.write(np.zeros((32, 32, 3), np.uint8))
+    assert file.read_bytes() == content
+
+
+@pytest.mark.parametrize("held", [False, True], ids=["an empty file", "an earlier film"])
+def test_an_earlier_film_is_replaced(tmp_path: Path, held: bool):
+    file = tmp_path / "film.mp4"
+    file.touch()
+    for frames in (1, 3) if held else (3,):
+        with VideoWriter(file, 30.0, encoder="mpeg4") as film:
+            for _ in range(frames):
+                film.write(np.zeros((32, 32, 3), np.uint8))
+    check_film(file, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
 def test_a_folder_that_takes_no_files_is_said_before_frames_are_drawn(tmp_path: Path):
@@ -108,6 +135,17 @@ def test_every_encoder_writes_a_whole_film(tmp_path: Path, encoder: Encoder):
     np.testing.assert_allclose(frame[24, 32, ::-1], (40, 20, 30), atol=12)
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
     assert (caution(encoder) is None) == (encoder in ("ffmpeg", "av"))
+
+
+@pytest.mark.parametrize("encoder", ["ffmpeg", "av", "mpeg4"])
+def test_a_relative_name_may_have_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder: Encoder):
+    needed = {"ffmpeg": ffmpeg_is_there(), "av": importlib.util.find_spec("av"), "mpeg4": True}
+    if not needed[encoder]:
+        pytest.skip(f"nothing here encodes with {encoder}")
+    monkeypatch.chdir(tmp_path)
+    with VideoWriter(Path("2026-11-29T10:30:00.mp4"), 25.0, encoder=encoder) as film:
+        film.write(np.zeros((32, 32, 3), np.uint8))
+    assert [path.name for path in tmp_path.iterdir()] == ["2026-11-29T10:30:00.mp4"]
 
 
 @pytest.mark.parametrize("encoder", ["ffmpeg", "av"])

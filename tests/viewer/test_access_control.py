@@ -8,6 +8,8 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
 
+from websockets.datastructures import Headers
+
 from vdgs.viewer.access_control import AccessControl
 from vdgs.viewer.server import startup_message
 
@@ -41,6 +43,21 @@ def test_cookies_of_other_servers_of_the_host_change_nothing(other):
     assert guarded.deny_reason("/", {"Host": "x", "Cookie": other}) is not None
     assert guarded.browser_of({"Cookie": f"{other}; vdgs_view_7_browser=me"}) == "me"
     assert guarded.browser_of({"Cookie": other}) is None
+
+
+def test_a_header_may_come_several_times():
+    """Proxies cut the cookies of HTTP/2 into several."""
+    guarded, alone = AccessControl("0.0.0.0", "abc", 7), AccessControl("127.0.0.1", None, 7)
+    cookies = Headers(
+        [("Host", "x"), ("Cookie", "a=1"), ("cookie", "vdgs_view_7=abc"), ("Cookie", "vdgs_view_7_browser=me")]
+    )
+    assert guarded.deny_reason("/", cookies) is None
+    assert guarded.browser_of(cookies) == "me"
+    assert guarded.browser_of(Headers()) is None
+    twice = Headers([("Host", "localhost:7"), ("Host", "localhost:7")])
+    assert "Host localhost:7, localhost:7" in str(alone.report("/", twice))
+    origins = Headers([("Host", "localhost:7"), ("Origin", "http://localhost:7"), ("Origin", "http://evil.example")])
+    assert "Pages of other sites" in str(alone.report("/", origins))
 
 
 def test_why_a_visitor_is_refused_is_told_without_what_could_let_in_or_draw():

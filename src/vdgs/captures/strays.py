@@ -14,6 +14,8 @@ from vdgs.system.atomic_files import read_json_or_empty
 from vdgs.system.permissions import refusal
 from vdgs.system.quoting import shell_word
 
+#: Files that systems lay into any folder.
+_SYSTEM_FILES = {".ds_store", "thumbs.db", "desktop.ini"}
 #: Folders that systems and programs keep for themselves; so are all whose names begin with a dot.
 _HIDDEN = re.compile(
     r"\..*|@.*|#recycle|\$recycle\.bin|__macosx|system volume information|lost\+found|_?thumb(nail)?s?|_?previews?"
@@ -68,6 +70,16 @@ _PREVIEW_STEM = re.compile(
 )
 #: How BlendedMVS ends the names of copies that are black where the mesh shows nothing: no photographs, and no masks.
 MASKED = "_masked"
+
+
+def is_system_file(name: str) -> bool:
+    """Whether a file is one that systems lay into any folder, by its name."""
+    return name.startswith("._") or name.lower() in _SYSTEM_FILES
+
+
+def is_of_system(name: str) -> bool:
+    """Whether a file or a folder is hidden or a system's or a program's own, by its name."""
+    return is_system_file(name) or _HIDDEN.fullmatch(name) is not None
 
 
 def why_not_read(folder: Path) -> str | None:

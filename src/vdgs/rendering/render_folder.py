@@ -6,10 +6,13 @@ render.json lists what was written, and says what it shows.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path, PurePath
 from typing import Any
 
+from vdgs.captures.strays import is_of_system
 from vdgs.errors import VdgsError
+from vdgs.rendering.sidecars import remove_sidecars, sidecar_names
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.system.units import some_names
 
@@ -21,14 +24,16 @@ def begin_render(folder: Path, names: Sequence[str]) -> list[str]:
     """Make a folder ready for files of these names; returns those that an earlier render left in it.
 
     They stay until `finish_render`. The manifest lists both from here on, so that a render that was cut off is known
-    again. Raises VdgsError, before anything is written, for a folder that holds anything but an earlier render; hidden
-    files count for nothing.
+    again. Raises VdgsError, before anything is written, for a folder that holds anything but an earlier render; what
+    systems lay into folders and programs beside pictures counts for nothing.
     """
     if folder.exists() and not folder.is_dir():
         raise VdgsError(f"{folder}: is a file. Give a folder for pictures, or a name that ends in .mp4 for a film.")
-    present = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".")} if folder.is_dir() else set()
+    present = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
     earlier = _listed_files(folder) & present
-    foreign = sorted(present - earlier - ({MANIFEST_FILE} if _has_manifest(folder) else set()))
+    ours = {*earlier, *chain.from_iterable(map(sidecar_names, earlier))}
+    ours |= {MANIFEST_FILE} if _has_manifest(folder) else set()
+    foreign = sorted(name for name in present - ours if name in names or not is_of_system(name))
     if foreign:
         shown = some_names(foreign, 3)
         raise VdgsError(
@@ -44,6 +49,8 @@ def finish_render(folder: Path, earlier: Sequence[str], names: Sequence[str], me
     """Remove what the earlier render left and this one did not write again; note what is there and what it shows."""
     for name in set(earlier) - set(names):
         (folder / name).unlink(missing_ok=True)
+    for name in {*earlier, *names}:
+        remove_sidecars(folder / name)
     write_json(folder / MANIFEST_FILE, {"written_by": _WRITER, "finished": True, **metadata, "files": sorted(names)})
 
 

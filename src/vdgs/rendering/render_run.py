@@ -26,7 +26,7 @@ from vdgs.rendering import camera_paths
 from vdgs.rendering.path_io import load_path
 from vdgs.rendering.render_folder import begin_render, finish_render
 from vdgs.rendering.scalar_maps import ScalarMap, add_colorbar, draw_colorbar, make_scalar_map
-from vdgs.rendering.video import VideoWriter, caution, default_encoder
+from vdgs.rendering.video import VideoWriter, caution, check_own_film, default_encoder
 from vdgs.runs.lod_folder import open_lod
 from vdgs.runs.open_run import OpenedModel, open_capture, open_model
 from vdgs.runs.run_cameras import RunCameras, load_run_cameras, run_cameras_of_capture
@@ -106,7 +106,7 @@ def render_run(request: RenderRequest, console: Console) -> None:
     """Render the views of a request on a device that is chosen already (`vdgs.kernels.device_selection`).
 
     Raises VdgsError for options that do not go together, an unusable path, codec or output, and for an output among the
-    capture's inputs or in a folder that holds anything but an earlier render.
+    capture's inputs, in a folder that holds anything but an earlier render, or in place of a film of others.
     """
     began = time.monotonic()
     _check(request)
@@ -178,6 +178,8 @@ def _check(request: RenderRequest) -> None:
         raise VdgsError("--raw writes the numbers of a map: it needs --mode depth, visibility or alpha.")
     if request.raw and request.output.suffix:
         raise VdgsError(f"{request.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
+    if request.output.suffix:
+        check_own_film(request.output)
 
 
 def _write_video(job: _Render, fps: float) -> str:

@@ -2,7 +2,8 @@
 
 H.264 (yuv420p) through the first of imageio-ffmpeg, PyAV and an `ffmpeg` with libx264 on the PATH; else VP9 through
 OpenCV, which Chromium, Firefox and Safari from 17 play, but not QuickTime nor the player of Windows; where OpenCV has
-no VP9 either, MPEG-4, which no browser plays. A finished film is looked at before it takes the place of another.
+no VP9 either, MPEG-4, which no browser plays. A finished film is looked at before it takes the place of another of
+ours, which a last box of kind `free` marks: players skip such boxes. Other files keep their place.
 
 H.264 is encoded by BT.709 in the limited range and says so: players read films that say nothing by their size, and not
 all alike. OpenCV can neither choose nor say the matrix (BT.601).
@@ -46,6 +47,9 @@ _FFMPEG_COLORS = (
     "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv"
 )
+#: The box that ends films of ours, whichever encoder wrote them.
+_MARK = b"vdgs render"
+_BOX = struct.pack(">I4s", 8 + len(_MARK), b"free") + _MARK
 _FOURCC = {"vp9": "vp09", "mpeg4": "mp4v"}
 _REMEDY = "Install an encoder with `pip install imageio-ffmpeg`, or render single images instead."
 
@@ -227,20 +231,22 @@ class VideoWriter:
 
     The file appears under its name when the block ends without an error and the film is whole, and not otherwise.
     Frames are uint8 [h, w, 3], all of the first one's size; an odd last row or column, which the codecs cannot hold, is
-    cut off. Raises VdgsError where the film cannot be encoded or written.
+    cut off. Raises VdgsError where the film cannot be encoded or written, or would replace what is no film of ours.
     """
 
     def __init__(self, path: Path, fps: float, encoder: Encoder | None = None) -> None:
         if path.suffix.lower() != ".mp4":
             raise VdgsError(f"{path}: films are written as MP4; give a name that ends in .mp4.")
         self.path, self.fps, self.encoder = path, fps, encoder or default_encoder()
-        self._partial = path.with_name(f".{path.name}.{process_mark()}.partial.mp4")
+        # absolute: programs take what stands before a colon in a relative name for a protocol
+        self._partial = path.absolute().with_name(f".{path.name}.{process_mark()}.partial.mp4")
         self._shape: tuple[int, ...] | None = None
         self._frames = 0
         self._pen: _Pen | None = None
 
     def __enter__(self) -> VideoWriter:
         check_takes_files(self.path.parent)
+        check_own_film(self.path)
         return self
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -270,7 +276,9 @@ class VideoWriter:
             try:
                 self._pen.close()
                 check_film(self._partial, self._frames)
-                with self._partial.open("rb") as film:
+                with self._partial.open("ab") as film:
+                    film.write(_BOX)
+                    film.flush()
                     os.fsync(film.fileno())
                 os.replace(self._partial, self.path)
             except OSError as fault:
@@ -302,6 +310,25 @@ class VideoWriter:
                 "folder, then run the same command again."
             )
         return VdgsError(f"{self.path} cannot be encoded ({why}). {_REMEDY}")
+
+
+def check_own_film(path: Path) -> None:
+    """Raise VdgsError where another file than a film of `VideoWriter`, or an empty one, has the name of a new film."""
+    if path.is_file() and path.stat().st_size and not _is_own_film(path):
+        raise VdgsError(
+            f"{path}: is there already, and no film of `vdgs render`. Nothing was drawn. Choose another name, or "
+            "remove the file."
+        )
+
+
+def _is_own_film(file: Path) -> bool:
+    """Whether a film ends with our mark; False too where it cannot be read."""
+    try:
+        with file.open("rb") as film:
+            film.seek(-min(len(_BOX), film.seek(0, os.SEEK_END)), os.SEEK_END)
+            return film.read() == _BOX
+    except OSError:
+        return False
 
 
 def check_film(file: Path, frames: int) -> None:

@@ -23,7 +23,7 @@ from vdgs.captures.image_suffixes import (
 from vdgs.captures.name_resolution import to_colmap_name, to_nfc
 from vdgs.captures.optional_decoders import INSTALL
 from vdgs.captures.reconstruction import FILMS_FILE, FRAMES_FOLDER
-from vdgs.captures.strays import MASKED, is_result, previewed_stem, walk
+from vdgs.captures.strays import MASKED, is_result, is_system_file, previewed_stem, walk
 from vdgs.errors import CaptureError
 from vdgs.sfm.picture_layers import layer_folders, picture_layers, unnamed_pictures
 from vdgs.system.atomic_files import read_json_or_empty
@@ -32,8 +32,6 @@ from vdgs.system.units import first_names, some_names
 
 #: What photographs are sent and downloaded in.
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tar.xz", ".tar.zst")
-#: Files beside a photograph that are no news.
-_SILENT = {".ds_store", "thumbs.db", "desktop.ini"}
 
 
 @dataclass
@@ -202,7 +200,7 @@ def _add(found: Found, path: Path, written: str, stems: set[str]) -> None:
 def _count_other(found: Found, path: Path, stems: set[str]) -> None:
     """A file that is no image that is read, or not used because its picture lies beside it."""
     suffix = path.suffix.lower()
-    if path.name.startswith("._") or path.name.lower() in _SILENT:
+    if is_system_file(path.name):
         return
     if is_dangling(path):
         if not path.name.startswith("."):  # editors' locks are such links

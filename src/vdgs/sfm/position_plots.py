@@ -65,7 +65,10 @@ def plot_residuals(
     for name, place in gcps.items():
         low, high = np.minimum(low, place[:2]), np.maximum(high, place[:2])
         axes.plot(*place[:2], "^", color=ACCENT, markersize=6, zorder=4)
-        axes.annotate(name, place[:2], textcoords="offset points", xytext=(5, 3), fontsize=TEXT_SIZE - 2, color=INK)
+        axes.annotate(
+            name, place[:2], textcoords="offset points", xytext=(5, 3), fontsize=TEXT_SIZE - 2, color=INK,
+            parse_math=False,
+        )  # fmt: skip
     margin = 0.05 * float((high - low).max()) + 1e-9
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     _write(figure, file)
@@ -75,7 +78,7 @@ def _axes(title: str, metric: bool = True):  # type: ignore[no-untyped-def]
     figure = Figure(figsize=(8.5, 7.5), dpi=style.DPI, layout="constrained")
     axes = figure.subplots()
     axes.set_aspect("equal", adjustable="box")
-    axes.set_title(title, loc="left", fontsize=TEXT_SIZE, color=INK)
+    axes.set_title(title, loc="left", fontsize=TEXT_SIZE, color=INK, parse_math=False)
     axes.set(xlabel="east [m]" if metric else "x", ylabel="north [m]" if metric else "y")
     style_axes(axes)
     return figure, axes

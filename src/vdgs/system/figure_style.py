@@ -48,12 +48,17 @@ def pluralize(number: int, noun: str) -> str:
 
 
 def draw_titles(figure: Figure, name: str, subtitle: str, note: str) -> None:
-    """Three lines in the upper left corner, above 1.1 inches of free space; smaller where the figure is too narrow."""
+    """Three lines in the upper left corner, above 1.1 inches of free space; smaller where the figure is too narrow.
+
+    They are drawn as they are, names with dollars too, which would else enclose a formula.
+    """
     width, height = figure.get_size_inches()
     lines = ((name, 0.38, 15.0, INK), (subtitle, 0.69, TEXT_SIZE, MUTED), (note, 1.0, NOTE_SIZE, MUTED))
     for text, down, size, color in lines:
         weight = "bold" if color == INK else "normal"
-        line = figure.text(0.85 / width, 1 - down / height, text, fontsize=size, fontweight=weight, color=color)
+        line = figure.text(
+            0.85 / width, 1 - down / height, text, fontsize=size, fontweight=weight, color=color, parse_math=False
+        )
         while line.get_window_extent().x1 > (width - 0.15) * figure.dpi and size > MIN_TITLE_SIZE:
             size *= 0.95  # hinted type does not shrink evenly
             line.set_fontsize(size)

@@ -52,19 +52,20 @@ class AccessControl:
 
     def deny_reason(self, path: str, headers: Mapping[str, str]) -> str | None:
         """Why a request may not come in; None if it may."""
-        host = headers.get("Host", "")
+        hosts = _values(headers, "Host")
+        host = hosts[0] if len(hosts) == 1 else ""  # nobody knows which of two names was meant
         if self.token is None and hostname_from_header(host) not in (*LOOPBACK_HOSTS, self.host):
             return (
                 "This server answers only to the name of this machine. Start it with --host to open it to others, or "
                 "let the proxy in front of it send Host: localhost and the same name as Origin."
             )
-        origin = headers.get("Origin")
-        if origin is not None and (_place_of(origin) or None) != host.lower():
+        origin = ", ".join(_values(headers, "Origin"))
+        if "Origin" in headers and (_place_of(origin) or None) != host.lower():
             return (
                 "Pages of other sites may not use this server. If a proxy stands in front of it, let it pass on the "
                 "Host of the visitor (nginx: proxy_set_header Host $http_host;)."
             )
-        if self.token is not None and not (self.has_token(path) or self._has_cookie(headers.get("Cookie", ""))):
+        if self.token is not None and not (self.has_token(path) or self._has_cookie(_cookie_header(headers))):
             return "The token is missing or wrong. Open the whole address that `vdgs view` printed."
         return None
 
@@ -73,7 +74,9 @@ class AccessControl:
         why = self.deny_reason(path, headers)
         if why is None:
             return None
-        names = (f"{name} {_short(headers[name])}" for name in ("Host", "Origin") if name in headers)
+        names = (
+            f"{name} {_short(', '.join(_values(headers, name)))}" for name in ("Host", "Origin") if name in headers
+        )
         return f"a visitor was refused ({', '.join(names) or 'no Host'}): {why} See docs/viewer.md."
 
     def has_token(self, path: str) -> bool:
@@ -87,7 +90,7 @@ class AccessControl:
 
     def browser_of(self, headers: Mapping[str, str]) -> str | None:
         """What tells a browser from others, by the cookie that it was given; None if it has none."""
-        return next(filter(None, _cookies(headers.get("Cookie", ""), f"{self.cookie_name}_browser")), None)
+        return next(filter(None, _cookies(_cookie_header(headers), f"{self.cookie_name}_browser")), None)
 
     def set_browser_header(self) -> str:
         """The header's value that gives a browser such a cookie, until it is closed."""
@@ -99,6 +102,19 @@ class AccessControl:
     def _is_token(self, given: str) -> bool:
         # Of bytes that are no text, headers hold surrogates.
         return self.token is not None and hmac.compare_digest(given.encode(errors="surrogatepass"), self.token.encode())
+
+
+def _values(headers: Mapping[str, str], name: str) -> list[str]:
+    """The values of a header. A proxy may send one several times, as HTTP/2 does with cookies, and the headers of
+    `websockets` give no single value then."""
+    if (get_all := getattr(headers, "get_all", None)) is not None:
+        return list(get_all(name))
+    return [headers[name]] if name in headers else []
+
+
+def _cookie_header(headers: Mapping[str, str]) -> str:
+    """All cookies as one header; empty where there are none."""
+    return "; ".join(_values(headers, "Cookie"))
 
 
 def _cookies(header: str, name: str) -> list[str]:

@@ -122,7 +122,16 @@ def write_laz(path: Path, scene: ExportScene) -> tuple[str, ...]:
         of_system = _las_wkt(_crs(path, scene.metadata.crs))[1]
     else:
         write_metadata_file(path, scene.metadata, Z_UP)
-    return (*of_system, *LOSS_NOTES, f"coordinates are rounded to {scale:g} {scene.metadata.unit}")
+    rounding = f"coordinates are rounded to {scale:g} {scene.metadata.unit}"
+    return (*of_system, *LOSS_NOTES, rounding, *_index_notes(path))
+
+
+def _index_notes(path: Path) -> tuple[str, ...]:
+    """That a cloud lies beside a file which QGIS has made of an earlier one and draws in its place."""
+    index = path.with_name(f"{path.stem}.copc.laz")
+    if not index.is_file():
+        return ()
+    return (f"{index.name} beside it is of an earlier file, and QGIS shows that one. If QGIS made it, remove it",)
 
 
 @contextmanager
@@ -147,9 +156,9 @@ def _las_header(path: Path, metadata: ExportMetadata, scale: float) -> laspy.Las
     header.scales = np.full(3, scale)
     header.offsets = np.array(metadata.origin)
     header.generating_software = metadata.program[:32]
+    header.global_encoding.wkt = True  # LAS 1.4 asks for it of point formats from 6 on, with a system or without
     if metadata.crs:
         header.vlrs.append(WktCoordinateSystemVlr(_las_wkt(_crs(path, metadata.crs))[0]))
-        header.global_encoding.wkt = True
     return header
 
 

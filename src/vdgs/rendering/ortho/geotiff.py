@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -67,16 +68,33 @@ def rasterio_crs(placement: MapProjection) -> Any:
     """The system as rasterio knows it: that of the catalogue, or a local one with name and unit.
 
     None where nobody knows the unit: GDAL writes metres for a local system whose unit has no size. The tags say then
-    what the coordinates are (`crs_name`).
+    what the coordinates are (`crs_name`). Raises VdgsError where rasterio does not know a system that pyproj knows.
     """
     crs = require_rasterio().crs.CRS
     if placement.wkt is not None:
-        return crs.from_user_input(placement.crs)
+        from rasterio.errors import CRSError
+
+        try:
+            return crs.from_user_input(placement.crs)
+        except CRSError as error:
+            raise VdgsError(f"{placement.crs}: rasterio does not know this system ({error}). {_remedy()}") from None
     if placement.meters_per_unit is None:
         return None
     unit = wkt_string("metre" if placement.meters_per_unit == 1 else placement.unit)
     local = f"LOCAL_CS[{wkt_string(placement.name)},UNIT[{unit},{placement.meters_per_unit!r}]"
     return crs.from_wkt(f'{local},AXIS["x",EAST],AXIS["y",NORTH]]')
+
+
+def _remedy() -> str:
+    """What to do where rasterio does not read the catalogue of systems."""
+    named = [name for name in ("PROJ_DATA", "PROJ_LIB") if os.environ.get(name)]
+    if not named:
+        return "Update it (pip install -U rasterio), or give another --crs."
+    variables = " and ".join(f"{name} ({os.environ[name]})" for name in named)
+    return (
+        f"The environment names the files of another PROJ by {variables}. Run `unset {' '.join(named)}`, then the same "
+        "command again."
+    )
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from vdgs.rendering.ortho.map_status import METADATA_FILE
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
+from vdgs.rendering.sidecars import remove_sidecars
 from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
@@ -146,7 +147,8 @@ def check_output_folder(folder: Path) -> None:
 def staging_folder(folder: Path) -> Iterator[Path]:
     """A folder inside `folder` whose files come to stand in it when all are there; nothing is left if not.
 
-    map.json comes last: while files take their places it says only whose they are. Raises VdgsError, with the remedy,
+    map.json comes last: while files take their places it says only whose they are. What programs have laid beside an
+    earlier file goes with it: they would show its numbers for those of the new one. Raises VdgsError, with the remedy,
     where the disk refuses.
     """
     try:
@@ -158,6 +160,7 @@ def staging_folder(folder: Path) -> Iterator[Path]:
                 write_json(folder / METADATA_FILE, {"software": software_name(), "finished": False})
                 for file in sorted(staging.iterdir(), key=lambda file: (file.name == METADATA_FILE, file.name)):
                     os.replace(file, folder / file.name)
+                    remove_sidecars(folder / file.name)
             except OSError as error:  # rasterio's errors are such too, and GDAL's own words mislead
                 raise reason_of(error, staging) from error
     except OSError as error:

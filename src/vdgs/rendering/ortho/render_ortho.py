@@ -150,8 +150,10 @@ def raster_layers(placement: MapProjection) -> tuple[RasterLayer, RasterLayer, R
 
 
 def _print_plan(plan: OrthoPlan, console: Console, sharded: bool = False) -> None:
-    """Print how large the map will be; raise VdgsError where the disk has no room for it."""
+    """Print how large the map will be; raise VdgsError where the disk has no room for it, or rasterio cannot name its
+    system."""
     grid, placement, folder = plan.grid, plan.placement, plan.folder
+    geotiff.rasterio_crs(placement)
     print_warning(console, plan.warning)
     for note in plan.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
