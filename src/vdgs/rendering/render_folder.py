@@ -12,7 +12,7 @@ from typing import Any
 
 from vdgs.captures.strays import is_of_system
 from vdgs.errors import VdgsError
-from vdgs.rendering.sidecars import remove_sidecars, sidecar_names
+from vdgs.rendering.picture_sidecars import remove_sidecars, sidecar_names
 from vdgs.system.atomic_files import read_json_or_empty, write_json
 from vdgs.system.units import some_names
 

@@ -25,7 +25,7 @@ from vdgs.rendering.ortho.map_status import METADATA_FILE
 from vdgs.rendering.ortho.nadir_camera import NadirCamera
 from vdgs.rendering.ortho.pixel_grid import PixelGrid
 from vdgs.rendering.ortho.tile_renderer import TileRenderer, samples_per_side
-from vdgs.rendering.sidecars import remove_sidecars
+from vdgs.rendering.picture_sidecars import remove_sidecars
 from vdgs.runs.motion_masks import with_motion_masks
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json_or_empty, reason_of, write_json
